@@ -46,7 +46,7 @@ def _hps(
     times = camera.timestamps[:: max(1, round(config.camera_fps / video["fps"]))]
     stop = np.inf if video["seconds"] is None else camera.timestamps[0].item() + video["seconds"]
     times = times[times < stop]
-    claps = [simulated.to_camera(clap) for clap in simulated.session.claps_s]
+    claps = [simulated.to_camera(clap) for clap in simulated.claps_s]
     file = Path("videos") / f"{name}.mp4"
     write_head_video(root / file, Scenery.of(world), camera.camera, path, times, Filming(), rng, claps)
     return replace(recording, camera=replace(camera, timestamps=times, video=file.as_posix()))

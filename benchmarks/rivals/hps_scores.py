@@ -12,12 +12,13 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from benchmarks.rivals.foot_surface import FootSurface, foot_surface, foot_vertices
 from wearcap.body.anny_body import anny_body
 from wearcap.body.model import BodyModel
 from wearcap.errors import WearcapError
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.metrics.position import joint_error_cm
-from wearcap.metrics.surface import Chamfer, FootSurface, chamfer, foot_surface, foot_vertices
+from wearcap.metrics.surface import Chamfer, chamfer
 from wearcap.metrics.table import evaluate_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Intervals

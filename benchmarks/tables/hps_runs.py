@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 
+from benchmarks.rivals.foot_surface import FootSurface
 from benchmarks.rivals.hps_scores import HpsScores, HpsTruth, score_hps
 from benchmarks.tables.hps_outages import Outage, disturbance, planted_outages, with_outage
 from benchmarks.tables.hps_sessions import Session, SessionSettings, TrueClock, load_session
 from wearcap.cli.conf import compose
-from wearcap.metrics.surface import FootSurface
 from wearcap.recording import Motion
 from wearcap.runtime.stages import run_stages
 from wearcap.runtime.system import CaptureInput

@@ -106,7 +106,7 @@ def sensors(options: Sensing) -> dict[str, dict[str, dict[str, Any]]]:
     draws: dict[str, list[Values]] = defaultdict(list)
     for seed in range(options.sessions):
         made = session(seed, options.config)
-        motion = made.session.simulated.motion
+        motion = made.motion.motion
         for draw in range(options.draws):
             rng = np.random.default_rng([34, seed, draw])
             for name in SUITS:
@@ -133,7 +133,7 @@ def session(seed: int, config: HpsConfig) -> Simulated:
 def suit_errors(
     simulated: Simulated, noise: SuitNoise, returns_m: tuple[float, ...], rng: np.random.Generator
 ) -> Values:
-    motion, contact = simulated.session.simulated.motion, simulated.session.simulated.contact
+    motion, contact = simulated.motion.motion, simulated.motion.contact
     suit = suit_motion(motion, contact, noise, rng)
     minutes = simulated.recording.duration_s / 60
     off = suit.T_world_joint.R @ motion.T_world_joint.R.mT
@@ -188,7 +188,7 @@ def localization_errors(simulated: Simulated, noise: LocalizationNoise, rng: np.
     still = replace(noise, position_m=(0.0, 0.0), rotation_deg=(0.0, 0.0), outliers=(0.0, 0.0), lost=(0.0, 0.0))
     bent = localize_statistically(path, still, rng)
     bend = (bent.t_world_cam - path.t_world_body)[bent.confidence > 0]
-    motion = simulated.session.simulated.motion
+    motion = simulated.motion.motion
     leaning = by_gravity(motion, noise.map, rng)
     tilt = rotation.geodesic(leaning.R_parent_joint[:1, 0], motion.R_parent_joint[:1, 0])
     edges = torch.cat([torch.tensor([False]), ~seen, torch.tensor([False])]).int().diff().nonzero()[:, 0]

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rivals.foot_surface import foot_surface, foot_vertices
 from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.model import FOOT_REGIONS
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.surface import SurfaceIndex
-from wearcap.metrics.surface import foot_surface, foot_vertices
 
 SLOPE = 0.3
 

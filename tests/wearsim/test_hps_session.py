@@ -78,7 +78,7 @@ def test_an_a_pose_is_stood(simulated):
 
 
 def test_claps_are_felt_and_found(simulated):
-    recording, claps = simulated.recording, torch.tensor(simulated.session.claps_s, dtype=torch.float64)
+    recording, claps = simulated.recording, torch.tensor(simulated.claps_s, dtype=torch.float64)
     assert len(claps) >= 6
     for stream in recording.imu.values():
         for clap in claps:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.foreign_tree import SIDES, ForeignTree
+from wearcap.body.foreign_tree import ForeignTree
 from wearcap.body.landmarks import t_pose
-from wearcap.body.skeleton import xsens23
+from wearcap.body.skeleton import SIDES, xsens23
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from wearcap.body.model import BodyModel, contact_regions, four_weights
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.rotation import swing_between
+from wearcap.geometry.rotation import matrix_from_rot6d, swing_between
 
 _CACHE: OrderedDict[tuple, BodyModel] = OrderedDict()
 _CACHE_SIZE = 32
@@ -252,11 +252,11 @@ class _Fit:
                 (arms[1], wrist - elbow),
                 (marks.forearm[side], wrist - elbow),
             ):
-                given[joint] = _frame(along, bend) @ _frame(out, -sign * eye[2]).T
+                given[joint] = _axes(along, bend) @ _axes(out, -sign * eye[2]).T
             index, middle, pinky = (
                 torch.from_numpy(self.person[f"{side[0]}-finger-{n}-1"]).double() for n in (2, 3, 5)
             )
-            given[arms[2]] = _frame(middle - wrist, index - pinky) @ _frame(out, eye[0]).T
+            given[arms[2]] = _axes(middle - wrist, index - pinky) @ _axes(out, eye[0]).T
         turns: list[Tensor] = []  # world rotations of the joints from the T-pose
         for joint, parent in enumerate(self.skeleton.parents):
             trunk = joint in (marks.root, marks.head, *marks.spine, *marks.neck) or joint in marks.collar.values()
@@ -369,12 +369,9 @@ def _foot(fit: _Fit, assets: AnnyAssets, points: np.ndarray, side: str, ankle: n
     return moved
 
 
-def _frame(along: Float[Tensor, "3"], across: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+def _axes(along: Float[Tensor, "3"], across: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """Right-handed axes: `along`, `across` orthogonalised to it, and their cross product."""
-    x = along / along.norm()
-    y = across - (across @ x) * x
-    y = y / y.norm()
-    return torch.stack([x, y, torch.linalg.cross(x, y)], -1)
+    return matrix_from_rot6d(torch.cat([along, across]))
 
 
 def _length(points) -> float:

@@ -8,17 +8,15 @@ frame to the frame that bones and the axes of bent knees and elbows span, for tr
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.joint_matching import BodyJoints, ancestors, common_ancestor
+from wearcap.body.joint_matching import BodyJoints, common_ancestor
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import Skeleton
-from wearcap.geometry.rotation import swing_between
+from wearcap.body.skeleton import SIDES, Skeleton, ancestors
+from wearcap.geometry.rotation import geodesic, matrix_from_rot6d, nearest_rotation, swing_between
 
-SIDES = ("left", "right")
 LIMBS = {"leg": ("hip", "knee", "ankle"), "arm": ("shoulder", "elbow", "wrist")}
 _BENT = 0.26
 """Sine of the bend (15°) from which a knee or an elbow shows its axis."""
@@ -93,8 +91,9 @@ def standing_rotation(
     if min(across.norm(), up.norm(), bones.min()) < 0.02 * max(bones.max(), torch.tensor(1e-9)):
         return None, "its joints lie on one another"
     R = _frame(1, across, 2, up)
-    nearest = _nearest(_snapped(R))
-    if torch.rad2deg(_angle(R, nearest)) < _SNAP_DEG:
+    along = torch.where(R.abs() == R.abs().amax(0, keepdim=True), R.sign(), torch.zeros_like(R))
+    nearest = nearest_rotation(along)
+    if torch.rad2deg(geodesic(R, nearest)) < _SNAP_DEG:
         R = nearest
     p = rest @ R  # the frame's columns are our axes in the file's: this is R^T rest
     for (hip, knee, ankle), (shoulder, elbow, wrist), side in zip(legs, arms, (1.0, -1.0)):
@@ -120,27 +119,11 @@ def standing_rotation(
     return R.T, ""
 
 
-def _snapped(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-    """The axes nearest to a frame's."""
-    return torch.where(R.abs() == R.abs().amax(0, keepdim=True), R.sign(), torch.zeros_like(R))
-
-
-def _nearest(M: Float[Tensor, "*t 3 3"]) -> Float[Tensor, "*t 3 3"]:
-    """The rotations nearest to matrices."""
-    return roma.special_procrustes(M)  # pyright: ignore[reportReturnType]
-
-
-def _angle(a: Tensor, b: Tensor) -> Tensor:
-    return (((a.T @ b).trace() - 1) / 2).clamp(-1, 1).acos()
-
-
 def _frame(first: int, a: Float[Tensor, "*t 3"], second: int, b: Float[Tensor, "*t 3"]) -> Float[Tensor, "*t 3 3"]:
     """Rotation whose column `first` points along a, and whose column `second` lies towards b."""
-    a = torch.nn.functional.normalize(a, dim=-1)
-    b = torch.nn.functional.normalize(b - (a * b).sum(-1, keepdim=True) * a, dim=-1)
-    third = 3 - first - second
+    along, across, normal = matrix_from_rot6d(torch.cat([a, b], -1)).unbind(-1)
     sign = 1.0 if (second - first) % 3 == 1 else -1.0
-    columns = {first: a, second: b, third: sign * torch.linalg.cross(a, b)}
+    columns = {first: along, second: across, 3 - first - second: sign * normal}
     return torch.stack([columns[k] for k in range(3)], -1)
 
 
@@ -161,7 +144,7 @@ def foreign_tree(
     names = {joint: role for role, joint in roles.items()}
     if R_ours_rest is None:
         frames = _frames_in_motion(parents, positions, found, kept, new_parents)
-        turns = [_nearest(_mean(R_world[:, joint].mT @ F, w)) for joint, (F, w) in zip(kept, frames)]
+        turns = [nearest_rotation(_mean(R_world[:, joint].mT @ F, w)) for joint, (F, w) in zip(kept, frames)]
         C = torch.stack(turns)
     else:
         C = R_ours_rest.T.expand(len(kept), 3, 3)
@@ -232,7 +215,7 @@ def _frames_in_motion(
     known: dict[int, tuple[Tensor, Tensor]] = {}
     for k, joint in enumerate(trunk):
         share = min(1.0, 1.5 * k / max(len(trunk) - 1, 1))
-        known[joint] = (_nearest((1 - share) * pelvis + share * chest), sure)
+        known[joint] = (nearest_rotation((1 - share) * pelvis + share * chest), sure)
     known[kept[0]] = (pelvis, sure)
     known[found.head] = (chest, sure)  # a head turns to both sides, but who stands straight looks ahead
     for side, sign in zip(SIDES, (1.0, -1.0)):

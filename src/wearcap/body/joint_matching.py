@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import SIDES, ancestors
 from wearcap.errors import WearcapError
 
 LEGS = """hip knee ankle, femur tibia foot, upleg leg foot, thigh shin foot, thigh calf foot, upperleg lowerleg foot,
@@ -92,7 +93,7 @@ def joints_by_name(names: Sequence[str], parents: Sequence[int], skeleton: str =
         fix = f"It has {', '.join(names)}; rename one."
         raise WearcapError(f"skeleton {skeleton!r} has no joint named head", fix=fix)
     limb, toe = {}, {}
-    for side in ("left", "right"):
+    for side in SIDES:
         for part, table in (("leg", LEGS), ("arm", ARMS)):
             limb[f"{side}_{part}"] = _limb(by_name, side, part, table, names, parents, skeleton)
         for name in (prefix + toe_name for prefix in (side, side[0]) for toe_name in _TOES):
@@ -121,15 +122,6 @@ def _limb(
     what = f"the {side} {part} of skeleton {skeleton!r} is not recognised"
     expected = "joints named like " + " or ".join("/".join(row) for row in alternatives[:3])
     raise WearcapError(what, expected=expected, fix=f"It has {', '.join(names)}; rename them.")
-
-
-def ancestors(parents: Sequence[int], joint: int) -> list[int]:
-    """The joint and all its ancestors, the root last; nothing for a joint below 0."""
-    chain = []
-    while joint >= 0:
-        chain.append(joint)
-        joint = parents[joint]
-    return chain
 
 
 def common_ancestor(parents: Sequence[int], *joints: int) -> int:
@@ -173,7 +165,7 @@ def joints_by_topology(
         end = positions[:, chain[-1]] - positions[:, ankle]
         bend = positions[:, knee] - (positions[:, hip] + positions[:, ankle]) / 2
         left_first += (forward * (end if chain[-1] != ankle else bend)).sum(-1).mean().item()
-    order = ("left", "right") if left_first > 0 else ("right", "left")
+    order = SIDES if left_first > 0 else SIDES[::-1]
     limb = dict(zip((f"{side}_leg" for side in order), limbs["leg"]))
     beside = positions[:, limbs["arm"][0][0]] - positions[:, limbs["arm"][1][0]]
     arm_order = order if (across * beside).sum() > 0 else order[::-1]

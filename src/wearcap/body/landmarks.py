@@ -13,11 +13,10 @@ from torch import Tensor
 
 from wearcap.body.joint_matching import joints_by_name
 from wearcap.body.kinematics import forward_kinematics, local_rotations
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import SIDES, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import swing_between
 
-_SIDES = ("left", "right")
 _SPLAY = 0.17
 """Lateral angle (rad) of a bind pose's shins above which its feet are taken to be rolled with them."""
 _UPRIGHT = math.cos(math.radians(15))
@@ -46,13 +45,13 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
     """Find the parts of the body. Raises WearcapError naming the limb that is not recognised."""
     found = joints_by_name(skeleton.joint_names, skeleton.parents, skeleton.name)
     head, limb, collar, toe, forearm = found.head, found.limb, {}, {}, {}
-    for side in _SIDES:
+    for side in SIDES:
         below = [joint for joint, parent in enumerate(skeleton.parents) if parent == limb[f"{side}_leg"][2]]
         toe[side] = max(below, key=lambda joint: skeleton.t_parent_joint[joint, 0].item(), default=None)
         forearm[side] = skeleton.parents[limb[f"{side}_arm"][2]]
     above_head = skeleton.ancestors(head)
     top = next(j for j in skeleton.ancestors(limb["left_arm"][0]) if j in above_head)
-    for side in _SIDES:
+    for side in SIDES:
         above = skeleton.parents[limb[f"{side}_arm"][0]]
         collar[side] = above if above not in above_head else None
     spine = skeleton.ancestors(top)[-2::-1]
@@ -116,7 +115,7 @@ def upright_frames(
     """World rotations in the frames in which the line from hips to shoulders is within 15° of the vertical."""
     marks = landmarks(skeleton)
     T = forward_kinematics(skeleton, R_parent_joint, R_parent_joint.new_zeros(len(R_parent_joint), 3))
-    hips, shoulders = (T.t[:, [marks.limb[f"{side}_{part}"][0] for side in _SIDES]].mean(1) for part in ("leg", "arm"))
+    hips, shoulders = (T.t[:, [marks.limb[f"{side}_{part}"][0] for side in SIDES]].mean(1) for part in ("leg", "arm"))
     up = torch.nn.functional.normalize(shoulders - hips, dim=-1)[:, 2] > _UPRIGHT
     return T.R[up]
 

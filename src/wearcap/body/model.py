@@ -10,7 +10,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.landmarks import landmarks
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import SIDES, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 
@@ -110,7 +110,7 @@ def contact_regions(
         normal.index_add_(0, faces[:, corner], face)
     down = -torch.nn.functional.normalize(normal, dim=-1)[:, 2]
     regions: dict[str, Tensor] = {}
-    for side in ("left", "right"):
+    for side in SIDES:
         ankle, wrist = marks.limb[f"{side}_leg"][2], marks.limb[f"{side}_arm"][2]
         foot = _carried_by(skeleton, weights, ankle) & (vertices[:, 2] < joints[ankle, 2] + 0.02)
         low, high = vertices[foot].min(0).values, vertices[foot].max(0).values

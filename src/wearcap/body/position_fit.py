@@ -10,7 +10,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.landmarks import landmarks
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import SIDES, Skeleton
 from wearcap.geometry import rotation
 from wearcap.geometry.rotation import swing_between
 
@@ -34,14 +34,16 @@ def fit_positions(
     offsets = skeleton.t_parent_joint.double()
     goal = {skeleton.index(name): place.double() for name, place in goals.items()}
     R = forward_kinematics(skeleton, R_parent_joint.double(), t_world_root.double()).R.clone()
-    left, right = (marks.limb[f"{side}_leg"][0] for side in ("left", "right"))
-    t_root = _pelvis(R, offsets[left], offsets[right], goal[left], goal[right])
+    left, right = (marks.limb[f"{side}_leg"][0] for side in SIDES)
+    R[:, 0] = swing_between(R[:, 0] @ (offsets[left] - offsets[right]), goal[left] - goal[right]) @ R[:, 0]
+    t_root = (goal[left] + goal[right]) / 2 - R[:, 0] @ ((offsets[left] + offsets[right]) / 2)
 
     def places() -> Tensor:
         return forward_kinematics(skeleton, local_rotations(skeleton, R), t_root).t
 
-    _spine(R, places, marks.spine, _rigid_with(marks, goal), goal)
-    for side in ("left", "right"):
+    follows_spine = [marks.neck[0] if marks.neck else marks.head, *(marks.limb[f"{side}_arm"][0] for side in SIDES)]
+    _spine(R, places, marks.spine, [joint for joint in follows_spine if joint in goal], goal)
+    for side in SIDES:
         collar, shoulder = marks.collar[side], marks.limb[f"{side}_arm"][0]
         if collar is not None:
             _aim(R, places(), [collar], shoulder, goal)
@@ -56,19 +58,6 @@ def fit_positions(
         if name.endswith("leg") and toe is not None:
             _aim(R, places(), [third, toe], toe, goal, third)
     return local_rotations(skeleton, R).to(R_parent_joint), t_root.to(t_world_root)
-
-
-def _rigid_with(marks, goal: dict[int, Tensor]) -> list[int]:
-    """Joints with goals whose places follow the top of the spine: first neck joint, shoulders."""
-    joints = [marks.neck[0] if marks.neck else marks.head, *(marks.limb[f"{s}_arm"][0] for s in ("left", "right"))]
-    return [joint for joint in joints if joint in goal]
-
-
-def _pelvis(R: Tensor, left: Tensor, right: Tensor, goal_left: Tensor, goal_right: Tensor) -> Tensor:
-    """Turn the root (in place) so that the hips' line is that of the goals; returns the root's place."""
-    turn = swing_between((R[:, 0] @ (left - right)), goal_left - goal_right)
-    R[:, 0] = turn @ R[:, 0]
-    return (goal_left + goal_right) / 2 - R[:, 0] @ ((left + right) / 2)
 
 
 def _spine(R: Tensor, places, spine: tuple[int, ...], rigid: list[int], goal: dict[int, Tensor]) -> None:

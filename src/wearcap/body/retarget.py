@@ -13,10 +13,9 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.landmarks import TPose, t_pose
-from wearcap.body.skeleton import Site, Skeleton
+from wearcap.body.skeleton import SIDES, Site, Skeleton
 from wearcap.geometry.rotation import swing_between
-
-_SIDES = ("left", "right")
+from wearcap.geometry.trajectory import interpolate_clamped
 
 
 def _arc_lengths(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
@@ -53,7 +52,7 @@ def _carry(
     chain(from_s.spine[:-1] or (top_s,), top_s if len(from_s.spine) > 1 else from_s.head, to.spine[:-1], top_t)
     given[top_t] = turn[..., top_s, :, :]
     chain(from_s.neck or (top_s,), from_s.head, to.neck, to.head)
-    for side in _SIDES:
+    for side in SIDES:
         for part in ("leg", "arm"):
             joints = zip(to.limb[f"{side}_{part}"], from_s.limb[f"{side}_{part}"])
             given |= {t: turn[..., s, :, :] for t, s in joints}
@@ -84,7 +83,7 @@ def retarget(
     T_world_source = forward_kinematics(source, R_parent_joint, t_world_root)
     turn = T_world_source.R @ pose_s.R.to(T_world_source.R).transpose(-1, -2)
     R_world = _carry(turn, pose_s, pose_t, target.parents) @ pose_t.R.to(turn)
-    hips = [pose_s.marks.limb[f"{side}_leg"][0] for side in _SIDES]
+    hips = [pose_s.marks.limb[f"{side}_leg"][0] for side in SIDES]
     centre = T_world_source.t[..., hips, :].mean(-2)
     t_root = centre - (R_world[..., 0, :, :] @ pose_t.hip_centre.to(centre)[:, None])[..., 0]
     T_world = forward_kinematics(target, local_rotations(target, R_world), t_root)
@@ -154,7 +153,7 @@ def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
     # Crowns and fingertips are never copied: files end those bones anywhere (CMU's head at its markers).
     pose_t = replace(pose_t, t=t)
     at = {name: pose_t.site(target, name, float(scale)) for name in target.sites}
-    for side in _SIDES:
+    for side in SIDES:
         heel, tip = f"{side}_heel", f"{side}_toe_tip"
         if not {heel, tip} <= set(at):
             continue
@@ -174,7 +173,7 @@ def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
 
 def _head_height(pose: TPose) -> Tensor:
     """Height of the head joint above the ankles (m)."""
-    ankles = pose.t[[pose.marks.limb[f"{side}_leg"][2] for side in _SIDES], 2]
+    ankles = pose.t[[pose.marks.limb[f"{side}_leg"][2] for side in SIDES], 2]
     return pose.t[pose.marks.head, 2] - ankles.mean()
 
 
@@ -192,11 +191,8 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
     def chain(points: Tensor, joints: tuple[int, ...], end: int) -> None:
         """Place a chain's joints on a polyline, at the fractions of its length that they have in the target."""
         knots, arc = _arc_lengths(target.t[[*joints, end]]), _arc_lengths(points)
-        wanted = (knots[:-1] / knots[-1].clamp_min(1e-9) * arc[-1]).contiguous()
-        after = torch.searchsorted(arc, wanted).clamp(1, len(points) - 1)
-        steps = (points[1:] - points[:-1]).norm(dim=-1)
-        weight = ((wanted - arc[after - 1]) / steps[after - 1].clamp_min(1e-9))[:, None]
-        places.update(zip(joints, (points[after - 1] * (1 - weight) + points[after] * weight).unbind(0)))
+        wanted = knots[:-1] / knots[-1].clamp_min(1e-9) * arc[-1]
+        places.update(zip(joints, interpolate_clamped(arc, points, wanted).unbind(0)))
 
     *lower, top = to.spine
     if lower:
@@ -204,7 +200,7 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
     places[top] = column[-1] if lower else column[0]
     if to.neck:
         chain(at_s[[neck_s, *from_s.neck[1:], from_s.head]], to.neck, to.head)
-    for side in _SIDES:
+    for side in SIDES:
         shoulder_s, shoulder_t = from_s.limb[f"{side}_arm"][0], to.limb[f"{side}_arm"][0]
         collar_s, collar_t = from_s.collar[side], to.collar[side]
         if collar_t is not None:

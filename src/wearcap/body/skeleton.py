@@ -16,6 +16,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 
+SIDES = ("left", "right")
 FOOT_PATCHES = ("left_heel", "left_toe_tip", "right_heel", "right_toe_tip")
 """Sites with floor contact labels and predictions, always in this order."""
 
@@ -105,10 +106,7 @@ class Skeleton:
 
     def ancestors(self, joint: int) -> list[int]:
         """The joint and all its ancestors, the root last."""
-        chain = [joint]
-        while self.parents[chain[-1]] >= 0:
-            chain.append(self.parents[chain[-1]])
-        return chain
+        return ancestors(self.parents, joint)
 
     @cached_property
     def levels(self) -> tuple[tuple[int, ...], ...]:
@@ -163,6 +161,15 @@ class Skeleton:
     def scaled(self, scale: float) -> "Skeleton":
         """The skeleton with all bones and sites scaled by one factor."""
         return self.with_offsets(self.t_parent_joint * scale)
+
+
+def ancestors(parents: Sequence[int], joint: int) -> list[int]:
+    """The joint and all its ancestors, the root last; nothing for a joint below 0."""
+    chain = []
+    while joint >= 0:
+        chain.append(joint)
+        joint = parents[joint]
+    return chain
 
 
 def mirrored(rows: Sequence) -> list[tuple[str, str, tuple[float, float, float]]]:

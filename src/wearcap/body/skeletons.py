@@ -11,7 +11,7 @@ import torch
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton, build_skeleton, xsens23
-from wearcap.errors import WearcapError
+from wearcap.errors import require_choice
 from wearcap.geometry.rotation import about_axis
 
 _SMPL_BODY = (
@@ -106,6 +106,5 @@ _BY_NAME = {"xsens23": xsens23, "smpl24": smpl24, "smplh52": smplh52, "smplx22":
 
 def skeleton_by_name(name: str) -> Skeleton:
     """One of the named skeletons. Raises WearcapError listing them."""
-    if name not in _BY_NAME:
-        raise WearcapError(f"no skeleton is called {name!r}", expected=f"one of {', '.join(_BY_NAME)}")
+    require_choice(name, _BY_NAME, f"no skeleton is called {name!r}")
     return _BY_NAME[name]()

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from wearcap.body.model import BodyModel, contact_regions, four_weights
 from wearcap.body.retarget import fit_offsets
-from wearcap.body.skeleton import Site, Skeleton
+from wearcap.body.skeleton import SIDES, Site, Skeleton
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError
 
@@ -61,7 +61,7 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
     regions = contact_regions(skeleton, skeleton.rest_joints, vertices.float(), arrays.faces, weights.float())
     # Heels, toe tips and crown are found on the surface.
     at = {"crown": ("head", vertices[vertices[:, 2].argmax()])}
-    for side in ("left", "right"):
+    for side in SIDES:
         heel, toes = (vertices[regions[f"{side}_{part}"]] for part in ("heel", "toes"))
         sole = torch.minimum(heel[:, 2].min(), toes[:, 2].min())
         at[f"{side}_heel"] = (f"{side}_ankle", torch.stack([heel[:, 0].min(), heel[:, 1].mean(), sole]))

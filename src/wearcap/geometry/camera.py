@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 
 _COEFFICIENTS = {"pinhole": (0,), "opencv": (4, 5), "fisheye": (4,), "fisheye624": (12,), "ocam": (13,)}
 
@@ -49,8 +49,7 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self):
-        if self.model not in _COEFFICIENTS:
-            raise WearcapError(f"no camera model {self.model!r}", expected=f"one of {', '.join(_COEFFICIENTS)}")
+        require_choice(self.model, _COEFFICIENTS, f"no camera model {self.model!r}")
         if len(self.distortion) not in _COEFFICIENTS[self.model]:
             counts = " or ".join(map(str, _COEFFICIENTS[self.model]))
             raise WearcapError(f"camera model {self.model!r} with {len(self.distortion)} coefficients", expected=counts)

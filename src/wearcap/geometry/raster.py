@@ -47,6 +47,11 @@ class Shadows(NamedTuple):
     """Height (m) over which a contact shade loses 63 % of its strength."""
 
 
+def empty_buffers(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nearness and index of a picture in which nothing is drawn yet."""
+    return np.full((height, width), -np.inf, np.float32), np.full((height, width), -1, np.int32)
+
+
 @compiled
 def _fill_triangle(a, b, c, number, nearness, index):
     """Draw one triangle given by its corners (x and y in pixels, nearness w)."""

@@ -88,7 +88,7 @@ def render(
     scene, pose = _joined(meshes), _camera_from_world(T_world_cam)
     R, t = (part.detach().double().cpu().numpy() for part in (T_world_cam.R, T_world_cam.t))
     in_cam = scene._replace(vertices=(scene.vertices - t) @ R, normals=(scene.normals @ R).astype(np.float32))
-    buffers = _empty_buffers(fine)
+    buffers = raster.empty_buffers(fine.height, fine.width)
     if fine.model == "pinhole":
         raster.draw_pinhole(in_cam.vertices, scene.faces, fine.fx, fine.fy, fine.cx, fine.cy, NEAR_M, *buffers)
     else:
@@ -130,12 +130,6 @@ def render(
     return replace(frame, depth=np.where(frame.index < frame.face_count, frame.depth, depth))
 
 
-def _empty_buffers(camera: Camera) -> tuple[Float32[np.ndarray, "height width"], Int32[np.ndarray, "height width"]]:
-    """Nearness and index of an image in which nothing is drawn yet."""
-    size = (camera.height, camera.width)
-    return np.full(size, -np.inf, np.float32), np.full(size, -1, np.int32)
-
-
 def _orthographic_map(
     meshes: Sequence[Mesh],
     to_viewer: tuple[float, float, float],
@@ -156,9 +150,8 @@ def _orthographic_map(
     axes[:2, 3] += radius
     scene = _joined(meshes)
     seen = scene.vertices @ axes[:, :3].T + axes[:, 3]
-    height = np.full((size, size), -np.inf, np.float32)
+    height, index = raster.empty_buffers(size, size)
     pixels = seen[:, :2] * (size / (2 * radius))
-    index = np.full((size, size), -1, np.int32)
     raster.draw_projected(pixels, seen[:, 2], np.ones(len(seen), bool), scene.faces, height, index)
     return height, axes
 
@@ -254,7 +247,7 @@ class SplatCloud:
 
         Depth is the point's own, along the optical axis, for fisheyes along the ray.
         """
-        nearness, index = _empty_buffers(camera)
+        nearness, index = raster.empty_buffers(camera.height, camera.width)
         pose = _camera_from_world(T_world_cam)
         blocks = self.points, self.first, self.centers, self.radii + radius_m
         lens, planes = lens_numbers(camera), _view_planes(camera)

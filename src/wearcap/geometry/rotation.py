@@ -88,9 +88,14 @@ def wrap_angle(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
+def nearest_rotation(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rotation nearest to a matrix: of a sum of rotations, their chordal mean."""
+    return roma.special_procrustes(matrix)  # pyright: ignore[reportReturnType]
+
+
 def mean_rotation(R: Float[Tensor, "sample 3 3"]) -> Float[Tensor, "3 3"]:
     """Chordal mean: the rotation nearest to the arithmetic mean of the matrices."""
-    return roma.special_procrustes(R.mean(0))  # pyright: ignore[reportReturnType]
+    return nearest_rotation(R.mean(0))
 
 
 def swing_between(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:

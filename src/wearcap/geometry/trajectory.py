@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
@@ -227,4 +226,4 @@ def smooth(trajectory: Trajectory, sigma_s: float) -> Trajectory:
     weight = weight / weight.sum(1, keepdim=True)
     t = torch.einsum("fk,fki->fi", weight, trajectory.t_world_body[near])
     R = torch.einsum("fk,fkij->fij", weight, trajectory.R_world_body[near])
-    return Trajectory(trajectory.timestamps, roma.special_procrustes(R), t)
+    return Trajectory(trajectory.timestamps, rotation.nearest_rotation(R), t)

@@ -175,26 +175,34 @@ def _followed(track: _Track, before: np.ndarray, after: np.ndarray, settings: Fl
     pixels = np.full_like(track.pixels, np.nan)
     if len(rows):
         start = track.pixels[rows]
-        end, moved = _flow(before, after, start, settings)
-        back, returned = _flow(after, before, end, settings)
-        inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
+        end, off_px, found = flow_there_and_back(before, after, start, settings.window_px, settings.levels)
         # Correlation coefficient of the patches; 0 for flat ones
         looks = (_patches(after, end, settings.window_px), track.look[rows])
         a, b = (look - look.mean((1, 2), keepdims=True) for look in looks)
         scale = np.sqrt((a**2).sum((1, 2)) * (b**2).sum((1, 2)))
         same = (a * b).sum((1, 2)) / np.maximum(scale, 1e-6) >= settings.likeness
-        near = np.linalg.norm(back - start, axis=-1) <= settings.return_px
-        good = moved & returned & inside & near & same
+        good = found & (off_px <= settings.return_px) & same
         pixels[rows[good]] = end[good]
     return replace(track, pixels=pixels, age=track.age + 1)
 
 
-def _flow(
-    before: np.ndarray, after: np.ndarray, start: Float32[np.ndarray, "keypoint 2"], settings: FlowSettings
-) -> tuple[Float32[np.ndarray, "keypoint 2"], Bool[np.ndarray, "keypoint"]]:
-    size, levels, points = (settings.window_px, settings.window_px), settings.levels, start[:, None]
-    end, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=size, maxLevel=levels)  # type: ignore[call-overload]
-    return end[:, 0], status[:, 0] == 1
+def flow_there_and_back(
+    before: np.ndarray,
+    after: np.ndarray,
+    start: Float32[np.ndarray, "point 2"],
+    window_px: int,
+    levels: int,
+    guess: Float32[np.ndarray, "point 2"] | None = None,
+) -> tuple[Float32[np.ndarray, "point 2"], Float32[np.ndarray, "point"], Bool[np.ndarray, "point"]]:
+    """Points' places in the next picture by optical flow (from a guess of them, if any), how far (px) from their start the
+    flow back takes them, and which are found both ways, within the picture."""
+    options = {"winSize": (window_px, window_px), "maxLevel": levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    first = np.array(start if guess is None else guess)
+    end, there, _ = cv2.calcOpticalFlowPyrLK(before, after, start, first, **options)  # type: ignore[call-overload]
+    first = np.array(end if guess is None else start)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, first, **options)  # type: ignore[call-overload]
+    inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
+    return end, np.linalg.norm(back - start, axis=-1), (there[:, 0] == 1) & (again[:, 0] == 1) & inside
 
 
 def _patches(

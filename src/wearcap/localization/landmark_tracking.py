@@ -22,6 +22,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.absolute_pose import CameraPose, Fit, Matches
+from wearcap.localization.keypoint_flow import flow_there_and_back
 from wearcap.localization.localizer import Localizer, confidence, counted, localization_of
 from wearcap.localization.point_map import check_size, undistortion
 from wearcap.localization.pose_chain import ChainedPose, joined
@@ -206,15 +207,10 @@ class LandmarkTracker:
         camera, limit_px, least = track.camera, self._limit_px(track), self.localizer.settings.min_inliers
         size = np.array(after.shape[::-1])
         scale = size / [camera.width, camera.height]
-        reduced = (((part + 0.5) * scale - 0.5)[:, None] for part in (track.pixels, _expected(track)))
+        reduced = ((part + 0.5) * scale - 0.5 for part in (track.pixels, _expected(track)))
         start, guess = (np.ascontiguousarray(part, np.float32) for part in reduced)
-        window = (self.settings.window_px, self.settings.window_px)
-        options = {"winSize": window, "maxLevel": _LEVELS, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-        end, status, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, **options)  # type: ignore[call-overload]
-        back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, start.copy(), **options)  # type: ignore[call-overload]
-        returns = np.linalg.norm(back - start, axis=2)[:, 0] < _RETURN_PX
-        end = end[:, 0]
-        kept = (status[:, 0] == 1) & (again[:, 0] == 1) & returns & (end > -0.5).all(1) & (end < size - 0.5).all(1)
+        end, off_px, found = flow_there_and_back(before, after, start, self.settings.window_px, _LEVELS, guess)
+        kept = found & (off_px < _RETURN_PX)
         if kept.sum() < least:
             return False
         pixels = ((end[kept] + 0.5) / scale - 0.5).astype(np.float32)

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from einops import rearrange
 from jaxtyping import Int64, UInt8
 from torch import Tensor, nn
 
@@ -80,7 +81,8 @@ class DiskExtractor:
         size = max(round(width * shrink), _SMALLEST), max(round(height * shrink), _SMALLEST)
         small = image if shrink == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         with torch.inference_mode():
-            batch = torch.tensor(small, device=self.device).permute(2, 0, 1)[None].float() / 255
+            pixels = torch.tensor(small, device=self.device)
+            batch = rearrange(pixels, "row column channel -> 1 channel row column").float() / 255
             found = self.network(batch, n=self.max_keypoints, pad_if_not_divisible=True)[0]
         parts = found.keypoints, found.descriptors, found.detection_scores
         keypoints, descriptors, scores = (part.float().cpu().numpy() for part in parts)

@@ -5,8 +5,9 @@ spread matches, so a more accurate pose. It is ours, as are confidence and covar
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import chain, pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -27,6 +28,7 @@ from wearcap.localization.visual_map import VisualMap, from_bytes
 from wearcap.recording.recording import Localization
 
 _Frame = TypeVar("_Frame")
+PRIOR_AGE_S = 1.0
 _UNKNOWN = 1e4
 """Variance (rad², m²) of a pose that was not found."""
 
@@ -201,12 +203,11 @@ def localize_video(
     localizer: Localizer,
     *,
     use_prior: bool = True,
-    prior_age_s: float = 1.0,
     progress: bool = False,
 ) -> Localization:
     """Localise every frame. Where no pose is found confidence is 0 and the last pose is repeated (at first: the first).
 
-    `use_prior`: the previous frame's pose, if not older than `prior_age_s`, helps to choose database pictures.
+    `use_prior`: the previous frame's pose, if not older than `PRIOR_AGE_S`, helps to choose database pictures.
     Raises WearcapError for more or fewer frames than timestamps, and as `Localizer.__call__`.
     """
     poses: list[CameraPose | None] = []
@@ -215,7 +216,7 @@ def localize_video(
     pictures = _one_ahead(lambda image: localizer.describe(image, camera), frames)
     for picture, now in zip(counted(pictures, len(times), progress), times):
         prior = None
-        if use_prior and last is not None and now - last[0] <= prior_age_s:
+        if use_prior and last is not None and now - last[0] <= PRIOR_AGE_S:
             prior = Rigid(last[1].R_world_cam, last[1].t_world_cam)
         pose = localizer.locate(picture, prior)
         last = last if pose is None else (now, pose)
@@ -253,11 +254,7 @@ def localization_of(poses: Sequence[CameraPose | None], timestamps: Float64[Tens
 def _one_ahead(describe: Callable[[np.ndarray], _Described], frames: Iterable[np.ndarray]) -> Iterator[_Described]:
     """Describe frames in a second thread, one frame ahead of the consumer."""
     with ThreadPoolExecutor(1) as pool:
-        pending: Future[_Described] | None = None
-        for frame in frames:
-            following = pool.submit(describe, frame)
-            if pending is not None:
-                yield pending.result()
-            pending = following
-        if pending is not None:
+        submitted = (pool.submit(describe, frame) for frame in frames)
+        for pending, _ in pairwise(chain(submitted, [None])):
+            assert pending is not None
             yield pending.result()

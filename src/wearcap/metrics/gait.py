@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float64
 from scipy.signal import find_peaks
 from torch import Tensor
 
+from wearcap.body.skeleton import SIDES
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording.motion import Motion
 
@@ -40,7 +41,7 @@ def normal_knee_deg() -> Float[Tensor, "point"]:
 def knee_deg(motion: Motion) -> Float[Tensor, "time side"]:
     """Flexion (degrees, 0 straight) of both knees, from the places of hip, knee and ankle."""
     hip, knee, ankle = (
-        torch.stack([motion.joint(f"{side}_{name}").t for side in ("left", "right")], 1).double()
+        torch.stack([motion.joint(f"{side}_{name}").t for side in SIDES], 1).double()
         for name in ("hip", "knee", "ankle")
     )
     thigh, shank = knee - hip, ankle - knee
@@ -54,7 +55,7 @@ def cycle_times(motion: Motion) -> list[Float64[Tensor, "cycle point"]]:
     path, ahead = pelvis.t.double().numpy(), pelvis.R[..., 0].double().numpy()
     times, flexion = motion.timestamps.numpy(), knee_deg(motion).numpy()
     found = []
-    for k, side in enumerate(("left", "right")):
+    for k, side in enumerate(SIDES):
         ankle, cycles = motion.joint(f"{side}_ankle").t[:, 2].numpy(), []
         peaks, _ = find_peaks(flexion[:, k], _PEAK_DEG, distance=max(round(0.45 * motion.fps), 1), prominence=15)
         for start, stop in pairwise(peaks.tolist()):

@@ -4,15 +4,15 @@ World z is up. Accelerations and third differences are computed in float64: they
 """
 
 import torch
+from einops import rearrange, reduce
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
 from wearcap.body.kinematics import site_positions
-from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.body.skeleton import FEET, FOOT_PATCHES, SIDES, Skeleton
 from wearcap.geometry.rigid import Rigid
 
-SIDES = ("left", "right")
 FLOOR_WINDOW_S = 10.0
 """Time to either side of a frame in which the lowest true joint is the local floor (thesis §6.4: 20 s in total)."""
 CONTACT_HEIGHT_M = 0.05
@@ -29,19 +29,20 @@ def jitter_m_s3(joints: Float[Tensor, "time joint 3"], fps: float) -> Float[Tens
 def foot_points(skeleton: Skeleton, T_world_joint: Rigid) -> Float[Tensor, "time foot point 3"]:
     """Two points (m) per foot, left foot first: heel and toe tip, or ankle and toe of a skeleton without such sites."""
     if all(patch in skeleton.sites for patch in FOOT_PATCHES):
-        return site_positions(skeleton, T_world_joint, FOOT_PATCHES).unflatten(-2, (2, 2))
+        points = site_positions(skeleton, T_world_joint, FOOT_PATCHES)
+        return rearrange(points, "time (foot point) xyz -> time foot point xyz", foot=FEET)
     return foot_joints(skeleton, T_world_joint)
 
 
 def foot_joints(skeleton: Skeleton, T_world_joint: Rigid) -> Float[Tensor, "time foot point 3"]:
     """Ankle and toe joint (m) of both feet, left foot first."""
     joints = [skeleton.index(f"{side}_{name}") for side in SIDES for name in ("ankle", "toe")]
-    return T_world_joint.t[:, joints].unflatten(-2, (2, 2))
+    return rearrange(T_world_joint.t[:, joints], "time (foot point) xyz -> time foot point xyz", foot=FEET)
 
 
 def foot_contact(contact: Bool[Tensor, "time patch"]) -> Bool[Tensor, "time foot"]:
     """Whether heel or toe tip of each foot is in contact; patches in the order of `FOOT_PATCHES`."""
-    return contact.unflatten(-1, (2, 2)).any(-1)
+    return reduce(contact, "time (foot patch) -> time foot", "any", foot=FEET)
 
 
 def contact_from_motion(

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import SIDES, Skeleton
 from wearcap.geometry.rotation import geodesic
 
 CM_PER_M = 100.0
@@ -31,9 +31,8 @@ def body_parts(skeleton: Skeleton) -> dict[str, list[int]]:
     hand: both wrists. lower: hips, knees, ankles, toes. upper: every joint above the pelvis, so all but the
     pelvis and the lower ones. Raises WearcapError when the skeleton lacks one of the named joints.
     """
-    sides = ("left", "right")
-    hand = [skeleton.index(f"{side}_wrist") for side in sides]
-    lower = [skeleton.index(f"{side}_{name}") for side in sides for name in ("hip", "knee", "ankle", "toe")]
+    hand = [skeleton.index(f"{side}_wrist") for side in SIDES]
+    lower = [skeleton.index(f"{side}_{name}") for side in SIDES for name in ("hip", "knee", "ankle", "toe")]
     upper = [joint for joint in range(1, len(skeleton)) if joint not in lower]
     return {"hand": hand, "lower": lower, "upper": upper}
 

@@ -5,10 +5,10 @@ degrees and centimetres.
 """
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import torch
+from einops import rearrange, reduce
 from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -57,7 +57,9 @@ class Symmetry:
                     return False
             return True
 
-        turns = [frame.T @ R @ frame for frame in (np.eye(3), principal) for R in _cube_group()]
+        turns = [
+            frame.T @ R @ frame for frame in (np.eye(3), principal) for R in Rotation.create_group("O").as_matrix()
+        ]
         turns = [R for R in turns if kept(R)]
         steps = 2 * np.pi / STEPS * np.arange(1, STEPS)
         axes: list[Float64[np.ndarray, "3"]] = []
@@ -137,12 +139,6 @@ def _center_and_axes(mesh: Mesh) -> tuple[Float64[np.ndarray, "3"], Float64[np.n
     return center, axes * np.linalg.det(axes)
 
 
-@cache
-def _cube_group() -> Float64[np.ndarray, "24 3 3"]:
-    """The rotations that bring a cube back to itself."""
-    return Rotation.create_group("O").as_matrix()
-
-
 def closest_surface_error_cm(
     T_found: Rigid, T_true: Rigid, cloud: Float[Tensor, "point 3"], middle: Float[Tensor, "3"], surface: TriangleIndex
 ) -> Float[Tensor, "time"]:
@@ -153,5 +149,7 @@ def closest_surface_error_cm(
     """
     T_true_found = T_true.to(torch.float64).inverse() @ T_found.to(torch.float64)
     points: Tensor = T_true_found[:, None] @ cloud[::EVERY].double()  # pyright: ignore[reportAssignmentType]
-    distance, _ = surface.nearest(np.ascontiguousarray((points + middle.double()).flatten(0, 1).numpy()))
-    return 100 * torch.from_numpy(distance).unflatten(0, points.shape[:2]).mean(-1)
+    distance, _ = surface.nearest(
+        np.ascontiguousarray(rearrange((points + middle.double()).numpy(), "time point xyz -> (time point) xyz"))
+    )
+    return 100 * reduce(torch.from_numpy(distance), "(time point) -> time", "mean", time=len(points))

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from wearcap.body.anatomy import at_landmarks, crown_over_head
 from wearcap.body.foreign_tree import ForeignTree, foreign_tree, joint_roles, standing_rotation, straightness
-from wearcap.body.joint_matching import ancestors, convention
+from wearcap.body.joint_matching import convention
 from wearcap.body.position_fit import fit_positions
 from wearcap.body.retarget import fit_offsets, retarget
-from wearcap.body.skeleton import xsens23
+from wearcap.body.skeleton import ancestors, xsens23
 from wearcap.boundary.opening import placed
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, DETECTED, Conventions

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.foreign_tree import LIMBS, SIDES
+from wearcap.body.foreign_tree import LIMBS
 from wearcap.body.joint_matching import BodyJoints, joints_by_name, joints_by_topology
-from wearcap.body.skeleton import xsens23
+from wearcap.body.skeleton import SIDES, xsens23
 from wearcap.boundary.texts import read_yaml_object
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.formats.bvh import HEIGHT_M, UNITS_M

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.foreign_tree import SIDES
 from wearcap.body.landmarks import head_level, upright_frames, with_head_face
-from wearcap.body.skeleton import Site, Skeleton
+from wearcap.body.skeleton import SIDES, Site, Skeleton
 from wearcap.geometry.rotation import swing_between
 from wearcap.recording.motion import Motion
 

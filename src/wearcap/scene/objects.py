@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
@@ -51,8 +51,7 @@ class Freedom:
     """Least and greatest angle (rad, counter-clockwise from above) or displacement along the axis (m); initially 0."""
 
     def __post_init__(self):
-        if self.kind not in FREEDOMS:
-            raise WearcapError(f"no degree of freedom {self.kind!r}", expected=f"one of {', '.join(FREEDOMS)}")
+        require_choice(self.kind, FREEDOMS, f"no degree of freedom {self.kind!r}")
         if (self.kind == "hinge") != (self.pivot is not None):
             what = f"a {self.kind} {'with' if self.pivot else 'without'} a pivot"
             raise WearcapError(what, expected="a hinge and a point of its axis together")
@@ -127,6 +126,25 @@ class SceneObject:
             angle = torch.atan2(cross, (arm * found_arm).sum(-1))
             place = self.freedom.moved(start, self.freedom.clamped(angle))
         return Rigid(place.R.to(T_world_object.R), place.t.to(T_world_object.t))
+
+    def displaced(
+        self, turn: Float64[Tensor, "3 3"], about: Float64[Tensor, "3"], to: Float64[Tensor, "3"]
+    ) -> "SceneObject":
+        """The object turned about a point (m) that goes to another place, its hinge or axis with it."""
+        freedom = self.freedom
+
+        def place(point: Float64[Tensor, "3"]) -> Float64[Tensor, "3"]:
+            return to + turn @ (point - about)
+
+        if freedom.pivot is not None:
+            pivot = place(torch.tensor(freedom.pivot, dtype=torch.float64))
+            freedom = replace(freedom, pivot=tuple(pivot.tolist()))
+        if freedom.axis is not None:
+            axis = turn @ torch.tensor(freedom.axis, dtype=torch.float64)
+            freedom = replace(freedom, axis=tuple(axis.tolist()))
+        R = (turn @ self.R_world_object.double()).to(self.R_world_object)
+        t = place(self.t_world_object.double()).to(self.t_world_object)
+        return replace(self, R_world_object=R, t_world_object=t, freedom=freedom)
 
     @property
     def points_world(self) -> Float64[np.ndarray, "vertex 3"]:
@@ -262,8 +280,8 @@ class Environment:
         Objects are at `T_world_object` where it names them, else at their initial pose; with a `contact_class` only
         objects of that class count. A point with NaN has no nearest object.
         """
-        if contact_class not in (None, *CONTACT_CLASSES):
-            raise WearcapError(f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}")
+        if contact_class is not None:
+            require_choice(contact_class, CONTACT_CLASSES, f"no contact class {contact_class!r}")
         moved = {self.index(name): pose for name, pose in (T_world_object or {}).items()}
         chosen = np.flatnonzero([contact_class in (None, item.freedom.contact_class) for item in self.objects])
         if not len(chosen):

@@ -1,8 +1,6 @@
 """Objects' initial poses corrected by the scan (ours): people measure where an object stands to centimetres, the scan
 holds it to millimetres."""
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 from jaxtyping import Float64
@@ -64,20 +62,7 @@ def _placed(item: SceneObject, scan: Scan, cloud: SlicedCloud) -> SceneObject:
         weight *= min(1.0, INDEPENDENT / max(near.sum(), 1))
         system = (jacobian * weight[:, None]).T @ jacobian + np.diag(PRIOR**-2)
         moved += np.linalg.solve(system, jacobian.T @ (weight * distance[near]) - moved / PRIOR**2)
-    turn = _about_z(moved[3])
-    shifted = middle + moved[:3] + turn @ (t - middle)
-    freedom = item.freedom
-    if freedom.pivot is not None:
-        pivot = middle + moved[:3] + turn @ (np.array(freedom.pivot) - middle)
-        freedom = replace(freedom, pivot=tuple(pivot.tolist()))
-    if freedom.axis is not None:
-        freedom = replace(freedom, axis=tuple((turn @ np.array(freedom.axis)).tolist()))
-    return replace(
-        item,
-        R_world_object=torch.from_numpy(turn @ R).to(item.R_world_object),
-        t_world_object=torch.from_numpy(shifted).to(item.t_world_object),
-        freedom=freedom,
-    )
+    return item.displaced(*map(torch.from_numpy, (_about_z(moved[3]), middle, middle + moved[:3])))
 
 
 def _about_z(angle: float) -> Float64[np.ndarray, "3 3"]:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float, Float64
 from scipy.optimize import least_squares
@@ -219,7 +218,7 @@ def align_by_walks(
         raise WearcapError(what, where="camera on the board", expected="about 90°", fix=fix)
     scale = (torch.tensor(length_m, dtype=torch.float64) / length).mean().item()
     axes = torch.eye(3, dtype=torch.float64)[:2]
-    R: Tensor = roma.special_procrustes(axes.T @ (displacements / length[:, None]))  # pyright: ignore[reportAssignmentType]
+    R = rotation.nearest_rotation(axes.T @ (displacements / length[:, None]))
     start = torch.tensor([0.0, 0.0, height_m], dtype=torch.float64)
     return scale, Rigid(R, start - R @ (scale * y_slam[0].double())).to(torch.float32)
 

@@ -35,6 +35,8 @@ _MAX_ALIKE = 0.5
 """Largest cosine between the wrists' accelerations: clapping hands stop each other, a landing pushes both up."""
 SOUND_BANDS_HZ = ((1000.0, 2000.0), (2000.0, 4000.0), (4000.0, 7500.0))
 """A clap is loud in all bands at once; a knock has lower frequencies, a whistle is in one band."""
+_MIN_RISE_DB, _MAX_LENGTH_S = 15.0, 0.1
+"""Least rise of a clap's sound above what is before it, and time after which it has decayed."""
 
 
 def detect_claps(*wrists: ImuStream) -> Float64[Tensor, "clap"]:
@@ -116,14 +118,12 @@ def _alike(times: np.ndarray, clocks: list[np.ndarray], jerks: list[np.ndarray])
     return (left * right).sum((1, 2)) / np.maximum(size, 1e-12)
 
 
-def detect_claps_audio(
-    waveform: Float[Tensor, "sample"], rate: float, min_rise_db: float = 15.0, max_length_s: float = 0.1
-) -> Float64[Tensor, "clap"]:
+def detect_claps_audio(waveform: Float[Tensor, "sample"], rate: float) -> Float64[Tensor, "clap"]:
     """Times (s from the first sample) of short, broadband onsets of a sound track.
 
-    In three bands from 1 to 7.5 kHz at once the sound must rise by `min_rise_db` above the loudest of the 60 ms
+    In three bands from 1 to 7.5 kHz at once the sound must rise by `_MIN_RISE_DB` above the loudest of the 60 ms
     before (a millisecond's energy each), stand out from the two seconds around, and be 10 dB below its peak again
-    after `max_length_s`. Raises WearcapError when there is none.
+    after `_MAX_LENGTH_S`. Raises WearcapError when there is none.
     """
     if rate < 16_000:
         raise WearcapError(f"a sound track of {rate:.0f} samples per second", expected="16000 or more")
@@ -143,11 +143,11 @@ def detect_claps_audio(
     before = np.concatenate([before[:, :1].repeat(4, 1), before[:, :-4]], 1)
     around = scipy.ndimage.median_filter(level[:, ::20], size=(1, 101), mode="nearest").repeat(20, 1)
     rise = (level - np.maximum(before, around[:, : level.shape[1]])).min(0)
-    onsets, _ = scipy.signal.find_peaks(rise, height=min_rise_db, distance=80)
+    onsets, _ = scipy.signal.find_peaks(rise, height=_MIN_RISE_DB, distance=80)
     total = 10 * np.log10((10 ** (level / 10)).sum(0))
     peak = scipy.ndimage.maximum_filter1d(total, 20, origin=-10)[onsets]
     later = scipy.ndimage.median_filter(total, 21, mode="nearest")
-    onsets = onsets[later[(onsets + round(1000 * max_length_s)).clip(max=len(total) - 1)] <= peak - 10]
+    onsets = onsets[later[(onsets + round(1000 * _MAX_LENGTH_S)).clip(max=len(total) - 1)] <= peak - 10]
     if not len(onsets):
         what = f"no clap found in {len(sound) / rate:.1f} s"
         expected = "a short sound with a sudden start, 1 to 7.5 kHz"

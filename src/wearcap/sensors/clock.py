@@ -15,6 +15,7 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording.recording import ImuStream, Recording
 from wearcap.sensors.stillness import StepCheck, Stretch
 
@@ -51,7 +52,9 @@ class Clock:
     residual_s: float
     """Root mean square error of the claps under the map; 0 with one clap per knot."""
     claps: int
-    """Number of common claps."""
+    """Number of common claps, or arm swings."""
+    std_s: float = 0.0
+    """Standard deviation of the offset at swings."""
 
     @property
     def offset_s(self) -> float:
@@ -66,15 +69,19 @@ class Clock:
         """The suit's time at a time of the camera."""
         return _through(camera_s, self.camera_s, self.suit_s, 1 / (1 + self.drift_s_per_hour / 3600))
 
+    def checks(self, joint: str) -> list[StepCheck]:
+        """Quality checks of a clock that is known from swings."""
+        more = "Swing ten times, and give the frames in which the hands are nearest to the camera."
+        step = f"arm swings, {joint}"
+        return [
+            StepCheck(step, "seen by both clocks", self.claps, 5, "", more, at_least=True),
+            StepCheck(step, "deviation of the offset", 1000 * self.std_s, 5.0, "ms", more),
+        ]
+
 
 def _through(time: Tensor, knots: Tensor, values: Tensor, rate: float) -> Tensor:
     """Linear between knots, beyond them with `rate`."""
-    inside = time.clamp(knots[0], knots[-1])
-    if len(knots) == 1:
-        return values[0] + (time - inside) * rate
-    after = torch.searchsorted(knots, inside.contiguous(), right=True).clamp(1, len(knots) - 1)
-    slope = (values[after] - values[after - 1]) / (knots[after] - knots[after - 1])
-    return values[after - 1] + (inside - knots[after - 1]) * slope + (time - inside) * rate
+    return interpolate_clamped(knots, values, time) + (time - time.clamp(knots[0], knots[-1])) * rate
 
 
 def fit_clock(
@@ -102,11 +109,11 @@ def fit_clock(
     return replace(clock, residual_s=off.square().mean().sqrt().item())
 
 
-def require_overlap(times: Mapping[str, Float64[Tensor, "_"]], fix: str, least_s: float = 1.0) -> None:
-    """Raise WearcapError, with all spans, unless streams share at least `least_s` seconds of one clock."""
+def require_overlap(times: Mapping[str, Float64[Tensor, "_"]], fix: str) -> None:
+    """Raise WearcapError, with all spans, unless streams share at least a second of one clock."""
     spans = {name: (stamps[0].item(), stamps[-1].item()) for name, stamps in times.items() if len(stamps)}
     shared = min(stop for _, stop in spans.values()) - max(start for start, _ in spans.values())
-    if shared < least_s:
+    if shared < 1.0:
         listed = ", ".join(f"{name} from {start:.2f} to {stop:.2f} s" for name, (start, stop) in spans.items())
         what = f"{listed}: they share {max(shared, 0):.2f} s"
         raise WearcapError(what, where="logs", expected="logs of one session on one clock", fix=fix)
@@ -192,23 +199,6 @@ def _matched(camera: np.ndarray, suit: np.ndarray, max_offset_s: float) -> tuple
     )
 
 
-@dataclass(frozen=True)
-class SwingClock:
-    """Clock estimated from swings, and the standard deviation (s) of its offset at the swings."""
-
-    clock: Clock
-    std_s: float
-
-    def checks(self, joint: str) -> list[StepCheck]:
-        """Quality checks of the swings."""
-        more = "Swing ten times, and give the frames in which the hands are nearest to the camera."
-        step = f"arm swings, {joint}"
-        return [
-            StepCheck(step, "seen by both clocks", self.clock.claps, 5, "", more, at_least=True),
-            StepCheck(step, "deviation of the offset", 1000 * self.std_s, 5.0, "ms", more),
-        ]
-
-
 def swing_peaks(stream: ImuStream, stretch: Stretch | None = None) -> Float64[Tensor, "swing"]:
     """Times (s, the stream's clock) at which the forearm is highest, finer than samples: the top of a parabola.
 
@@ -252,7 +242,7 @@ def swing_peaks(stream: ImuStream, stretch: Stretch | None = None) -> Float64[Te
 
 def fit_swing_clock(
     camera_s: Float64[Tensor, "swing_camera"], watch_s: Float64[Tensor, "swing_watch"], frame_s: float
-) -> SwingClock:
+) -> Clock:
     """Fit the clock that maps the watch's swings to the camera's, whose times are accurate to half a frame.
 
     `fit_clock` finds the correspondences and the drift. The offset is then its posterior mean: camera times have a
@@ -280,4 +270,4 @@ def fit_swing_clock(
     posterior /= posterior.sum()
     mean = float(posterior @ offset)
     std = float(np.sqrt(posterior @ (offset - mean) ** 2))
-    return SwingClock(replace(clock, camera_s=clock.camera_s + mean), std)
+    return replace(clock, camera_s=clock.camera_s + mean, std_s=std)

@@ -5,59 +5,59 @@ initialisation, the suit's pose moved to the camera's path (§4.2.5, eq. 4.13).
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, nearest_frames, outlier_mask, resample
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Localization
-from wearcap.sensors.path_fusion import CameraSamples, DriftPrior, fuse_paths
+from wearcap.sensors.path_fusion import CameraSamples, DriftPrior, columns_at, fuse_paths
 
 MAX_SPEED = 3.0
 """m/s between localised positions beyond which one of them is wrong (thesis §4.2.5)."""
 PATHS = ("tangent", "fused")
-TILT_SCALE = 0.05
-"""Robust scale (rad) of the direction of gravity."""
+TILT_SCALE, TURN_SCALE = 0.05, 0.05
+"""Robust scales (rad) of the direction of gravity, and of the suit's heading."""
+MOST_TILT_DEG = 5.0
+"""Tilt beyond which a map is taken as level."""
+FIRST_S = 10.0
+"""Time of localised frames over which the suit's heading is aligned."""
 
 
 def align_suit(
-    suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0, tilt: bool = False
+    suit: Motion, localization: Localization, mount: Rigid, tilt: bool = False
 ) -> tuple[Motion, Float[Tensor, ""]]:
     """Move a suit's motion into the scene by a rotation about gravity and a translation: (motion, angle in rad).
 
     With `tilt` (ours) the motion is first tilted to gravity's direction in the map (`gravity_in_map`); the thesis
     takes the map as level.
 
-    The angle is that of eq. 4.14, estimated robustly over the first `first_s` seconds of localised frames instead of
+    The angle is that of eq. 4.14, estimated robustly over the first `FIRST_S` seconds of localised frames instead of
     frame 0, which may be an outlier; it turns root orientation and path of all frames (eq. 4.15). The translation moves
     the worn camera to its localised positions. `mount` is the camera's nominal pose in head axes, T_head_cam. Clocks
     must agree already. Raises WearcapError when no localised frame lies within the suit's time.
     """
-    seen = inliers(localization)
     if tilt:
         up = gravity_in_map(suit, localization, mount.R).float()
         R_map_suit = rotation.exp(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), up))
         suit = suit.moved(Rigid(R_map_suit, suit.t_world_root[0] - R_map_suit @ suit.t_world_root[0]))
-    inside = localization.timestamps >= suit.timestamps[0]
-    inside &= seen & (localization.timestamps <= suit.timestamps[-1])
-    step = localization.timestamps.diff().median().item() if len(seen) > 1 else first_s
-    early = inside & (inside.cumsum(0) <= max(round(first_s / step), 1))
+    inside = _inliers_during(suit, localization)
+    step = localization.timestamps.diff().median().item() if len(inside) > 1 else FIRST_S
+    early = inside & (inside.cumsum(0) <= max(round(FIRST_S / step), 1))
     if not early.any():
         raise WearcapError(
-            f"none of {len(seen)} frames is localised between {suit.timestamps[0]:.1f} s and "
+            f"none of {len(inside)} frames is localised between {suit.timestamps[0]:.1f} s and "
             f"{suit.timestamps[-1]:.1f} s",
             where="localization",
             expected="camera poses on the suit's clock",
             fix="Synchronise the clocks, or check the map.",
         )
     times, weight = localization.timestamps[early], localization.confidence[early]
-    head = suit.joint("head")
-    head = resample(Trajectory(suit.timestamps, head.R, head.t), times).T_world_body
+    head = _head_at(suit, times)
     T_world_cam = Rigid(localization.R_world_cam[early], localization.t_world_cam[early]).to(head.t.dtype)
     angle, certainty = yaw_between(head.R, T_world_cam.R @ mount.R.mT)
     turn = _robust_angle(angle, weight * certainty)
@@ -67,35 +67,31 @@ def align_suit(
     return suit.moved(Rigid(R_scene_suit, move)), turn
 
 
-def gravity_in_map(
-    suit: Motion, localization: Localization, R_head_cam: Float[Tensor, "3 3"], most_deg: float = 5.0
-) -> Float64[Tensor, "3"]:
+def gravity_in_map(suit: Motion, localization: Localization, R_head_cam: Float[Tensor, "3 3"]) -> Float64[Tensor, "3"]:
     """Direction (unit vector, map axes) that the suit's sensors measure as up, where a map is not level.
 
     Independent of the heading, which may drift: seen from the camera, up is R_world_cam^T n by the map and
     R_head_cam^T R_world_head^T e_z by the suit. n and the mount R_head_cam, of which the nominal value is the first
     guess, are found in turn by weighted means (Wahba's problem) whose weights fall with the angle between both. A
-    wearer who looks into different directions separates the two; beyond `most_deg` the map is taken as level.
+    wearer who looks into different directions separates the two; beyond `MOST_TILT_DEG` the map is taken as level.
     """
-    seen = inliers(localization)
-    seen &= (localization.timestamps >= suit.timestamps[0]) & (localization.timestamps <= suit.timestamps[-1])
-    head = suit.joint("head")
-    R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), localization.timestamps[seen]).R_world_body
-    R_cam, up_head = localization.R_world_cam[seen].double(), R_world_head.double()[:, 2]
     level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    seen = _inliers_during(suit, localization)
     if not seen.any():
         return level
+    R_world_head = _head_at(suit, localization.timestamps[seen]).R
+    R_cam, up_head = localization.R_world_cam[seen].double(), R_world_head.double()[:, 2]
     up, weight = level, localization.confidence[seen].double()
     w = weight
     for _ in range(30):
         up_cam = (R_cam.mT @ up[:, None])[..., 0]
         both = torch.einsum("t,ti,tj->ij", w, up_head, up_cam)
-        mount: Tensor = roma.special_procrustes(both)  # pyright: ignore[reportAssignmentType]
+        mount = rotation.nearest_rotation(both)
         by_suit = (R_cam @ (mount.mT @ up_head[..., None]))[..., 0]
         up = torch.nn.functional.normalize((w[:, None] * by_suit).sum(0), dim=0)
         off = torch.linalg.cross(by_suit, up.expand_as(by_suit)).norm(dim=-1)
         w = weight / (1 + (off / TILT_SCALE) ** 2) ** 2
-    return up if up[2] > np.cos(np.deg2rad(most_deg)) else level
+    return up if up[2] > np.cos(np.deg2rad(MOST_TILT_DEG)) else level
 
 
 def inliers(localization: Localization) -> Bool[Tensor, "time"]:
@@ -103,6 +99,18 @@ def inliers(localization: Localization) -> Bool[Tensor, "time"]:
     found = (localization.confidence > 0) & localization.R_world_cam.isfinite().all(-1).all(-1)
     position = torch.where(found[:, None], localization.t_world_cam, torch.nan)
     return outlier_mask(Trajectory(localization.timestamps, localization.R_world_cam, position), MAX_SPEED)
+
+
+def _inliers_during(suit: Motion, localization: Localization) -> Bool[Tensor, "time"]:
+    """The inliers within the suit's time."""
+    times = localization.timestamps
+    return inliers(localization) & (times >= suit.timestamps[0]) & (times <= suit.timestamps[-1])
+
+
+def _head_at(suit: Motion, times: Float64[Tensor, "sample"]) -> Rigid:
+    """Poses of the head at other times."""
+    head = suit.joint("head")
+    return resample(Trajectory(suit.timestamps, head.R, head.t), times).T_world_body
 
 
 def yaw_between(
@@ -118,18 +126,16 @@ def yaw_between(
     return torch.atan2(sin, cos), torch.hypot(sin, cos) / 2
 
 
-def _robust_angle(
-    angle: Float[Tensor, "sample"], weight: Float[Tensor, "sample"], scale_rad: float = 0.05
-) -> Float[Tensor, ""]:
+def _robust_angle(angle: Float[Tensor, "sample"], weight: Float[Tensor, "sample"]) -> Float[Tensor, ""]:
     """Centre (rad) of angles on the circle: the sample with the least weighted sum of distances to all others, then
-    reweighted means in which an angle `scale_rad` away counts a quarter, and far ones hardly."""
+    reweighted means in which an angle `TURN_SCALE` away counts a quarter, and far ones hardly."""
     # A subset of candidates suffices for the initial estimate.
     candidates = angle[:: max(len(angle) // 300, 1)]
     distance = rotation.wrap_angle(candidates[:, None] - angle).abs()
     centre = candidates[(distance @ weight).argmin()]
     for _ in range(30):
         off = rotation.wrap_angle(angle - centre)
-        w = weight / (1 + (off / scale_rad) ** 2) ** 2
+        w = weight / (1 + (off / TURN_SCALE) ** 2) ** 2
         centre = rotation.wrap_angle(centre + (w * off).sum() / w.sum())
     return centre
 
@@ -154,11 +160,10 @@ def estimate_head_camera(
         raise WearcapError("no localised frame", expected="at least one, to estimate the camera's mount on the head")
     R, weight = R_world_head[good].mT @ R_world_cam[good], confidence[good]
     median = torch.stack([_weighted_median(R[:, :, column], weight) for column in range(3)], -1)
-    centre: Tensor = roma.special_procrustes(median)  # pyright: ignore[reportAssignmentType]
+    centre = rotation.nearest_rotation(median)
     for _ in range(20):
         w = weight / rotation.geodesic(R, centre.expand_as(R)).clamp(min=0.005)
-        mean = (w[:, None, None] * R).sum(0) / w.sum()
-        centre = roma.special_procrustes(mean)  # pyright: ignore[reportAssignmentType]
+        centre = rotation.nearest_rotation((w[:, None, None] * R).sum(0) / w.sum())
     return centre
 
 
@@ -184,8 +189,7 @@ class InitializationSettings:
     """Whether the suit's motion is tilted to gravity's direction in the map (ours)."""
 
     def __post_init__(self):
-        if self.path not in PATHS:
-            raise WearcapError(f"path={self.path!r}", expected=f"one of {', '.join(PATHS)}")
+        require_choice(self.path, PATHS, f"path={self.path!r}")
 
 
 @dataclass(frozen=True)
@@ -215,8 +219,8 @@ def initialize(
     better R_head_cam. Outliers at 3 m/s are removed to convergence. Raises WearcapError when no frame is localised in the
     suit's time.
     """
-    settings, suit, seen = settings or InitializationSettings(), suit_aligned, inliers(localization)
-    seen &= (localization.timestamps >= suit.timestamps[0]) & (localization.timestamps <= suit.timestamps[-1])
+    settings, suit = settings or InitializationSettings(), suit_aligned
+    seen = _inliers_during(suit, localization)
     if not seen.any():
         what = "no localised frame in the suit's time"
         fix = "Synchronise the clocks, or check the map."
@@ -226,7 +230,8 @@ def initialize(
     valid = (times[nearest_frames(times, suit.timestamps)] - suit.timestamps).abs() <= 1.5 * step
     body = body_camera(suit, t_head_cam)
     if settings.path == "tangent":
-        camera = _interpolated(suit.timestamps, times, localization.t_world_cam[seen])
+        places = localization.t_world_cam[seen].double().numpy()
+        camera = torch.from_numpy(columns_at(suit.timestamps.numpy(), times.numpy(), places))
         yaw = _tangent_yaw(suit.timestamps, body.double(), camera, valid, settings)
     else:
         samples = _samples(suit, localization, seen, R_head_cam)
@@ -246,9 +251,9 @@ def _samples(
     suit: Motion, localization: Localization, seen: Bool[Tensor, "time"], R_head_cam: Float[Tensor, "3 3"]
 ) -> CameraSamples:
     """Positions and headings of the localised frames that are `seen`."""
-    times, head = localization.timestamps[seen], suit.joint("head")
-    R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
-    yaw, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT)
+    times = localization.timestamps[seen]
+    R_world_head = _head_at(suit, times).R
+    yaw, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(R_world_head) @ R_head_cam.mT)
     confidence = localization.confidence[seen].double()
     position = localization.t_world_cam[seen].double()
     return CameraSamples(times, position, yaw.double(), confidence, confidence * certainty.double())
@@ -275,11 +280,3 @@ def _tangent_yaw(
     frame = torch.where(moving, torch.arange(len(body)), -1).cummax(0).values
     frame = torch.where(frame < 0, moving.nonzero()[0], frame)
     return (by_camera * by_suit.conj()).angle()[frame]
-
-
-def _interpolated(
-    at: Float64[Tensor, "time"], times: Float64[Tensor, "sample"], value: Float[Tensor, "sample axis"]
-) -> Float64[Tensor, "time axis"]:
-    """Linear interpolation; the end samples are repeated outside."""
-    columns = [np.interp(at.numpy(), times.numpy(), column) for column in value.double().numpy().T]
-    return torch.from_numpy(np.stack(columns, -1))

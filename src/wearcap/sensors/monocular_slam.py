@@ -9,7 +9,6 @@ its share of a_slam's variance. So the equation is solved as a_slam = (1/s) R f 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
@@ -19,9 +18,11 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import swing_between
 from wearcap.geometry.trajectory import Trajectory, filled, find_gaps, interpolate, pieces, require_rising, resample
 from wearcap.recording.recording import ImuStream
+from wearcap.sensors.camera_alignment import SlamAlignment
 from wearcap.sensors.imu import GRAVITY, acceleration
 from wearcap.sensors.stillness import Stretch, during
 
@@ -100,35 +101,14 @@ def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]
     return float(metres @ lengths / (lengths @ lengths)), float(np.ptp(scales) / scales.mean())
 
 
-@dataclass(frozen=True)
-class _GravityScale:
-    """Vertical and scale of a SLAM's world. The heading stays the SLAM's: R_world_slam is the least turn that puts z up."""
-
-    R_world_slam: Float64[Tensor, "3 3"]
-    scale: float
-    """Metres per unit of the SLAM."""
-    scale_std: float
-    gravity_std_deg: float
-    """Standard deviation of the vertical's direction."""
-
-    @property
-    def scale_std_percent(self) -> float:
-        return 100 * self.scale_std / self.scale
-
-
-def by_head_imu(
-    slam: Trajectory,
-    imu: ImuStream,
-    R_cam_imu: Float[Tensor, "3 3"] | None = None,
-    t_cam_imu: Float[Tensor, "3"] | None = None,
-) -> _GravityScale:
-    """Scale and vertical from a sensor (acc_imu, the camera's clock) fixed to the camera at a known place (m).
+def by_head_imu(slam: Trajectory, imu: ImuStream, T_cam_imu: Rigid | None = None) -> SlamAlignment:
+    """Scale and vertical (`_upright`) from a sensor (acc_imu, the camera's clock) fixed to the camera at a known place (m).
 
     Huber's robust least squares in (1/s, g/s, bias/s); its covariance allows for correlated errors within a second.
     Raises WearcapError where the two overlap by less than 10 s, do not move enough to observe the scale, or contradict
     each other: gravity not 9.81 m/s² long, or a negative scale.
     """
-    a_slam, force_slam, R, fps = _alike(slam, imu, R_cam_imu, t_cam_imu)
+    a_slam, force_slam, R, fps = _alike(slam, imu, T_cam_imu or Rigid.identity())
     # a_slam = k R f - h - R b with h = -g/s (up), b = k bias
     rows = np.concatenate([force_slam[:, :, None], np.broadcast_to(-np.eye(3), R.shape), -R], 2)
     # Huber's estimate of x in rows @ x = y, and its covariance with errors that are correlated within blocks;
@@ -169,12 +149,10 @@ def by_head_imu(
     direction = up / np.linalg.norm(up)
     across = np.eye(3) - np.outer(direction, direction)
     turn = across @ covariance[1:4, 1:4] @ across / (up @ up)
-    return _GravityScale(_upright(direction), 1 / k, deviation / k, math.degrees(math.sqrt(np.trace(turn))))
+    return _upright(direction, 1 / k, deviation, math.sqrt(np.trace(turn)))
 
 
-def _alike(
-    slam: Trajectory, imu: ImuStream, R_cam_imu: Tensor | None, t_cam_imu: Tensor | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _alike(slam: Trajectory, imu: ImuStream, T_cam_imu: Rigid) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Second differences of the camera's path, the specific force through the same filter, R_slam_imu, and frame rate.
 
     (p(t-h) + p(t+h) - 2p(t)) / h² is the acceleration under a triangle of half-width h; so the forces go under one, too.
@@ -195,9 +173,8 @@ def _alike(
     # On the camera's frames: between them positions would be interpolated, which flattens them.
     first = slam.timestamps[torch.searchsorted(slam.timestamps, start)].item()
     dense = torch.arange(first, stop.item(), step / fine, dtype=torch.float64)
-    R_cam_imu = torch.eye(3) if R_cam_imu is None else R_cam_imu
     poses = resample(Trajectory(slam.timestamps, slam.R_world_body.double(), slam.t_world_body.double()), dense)
-    R = poses.R_world_body @ R_cam_imu.double()
+    R = poses.R_world_body @ T_cam_imu.R.double()
     force = interpolate(imu.timestamps, imu.acc_imu.double(), dense)
     force_slam = (R @ force[..., None])[..., 0].numpy()
     triangle = np.bartlett(2 * n * fine + 1)
@@ -205,26 +182,20 @@ def _alike(
         scipy.ndimage.convolve1d(value, triangle / triangle.sum(), axis=0)[::fine]
         for value in (force_slam, R.numpy().reshape(-1, 9))
     )
-    arm = torch.zeros(3) if t_cam_imu is None else t_cam_imu
-    swung = acceleration((poses.R_world_body @ arm.double())[::fine], 1 / step, n).numpy()
+    swung = acceleration((poses.R_world_body @ T_cam_imu.t.double())[::fine], 1 / step, n).numpy()
     a_slam = acceleration(poses.t_world_body[::fine], 1 / step, n).numpy()
     inner = slice(n, len(a_slam) - n)
     return a_slam[inner], (force_slam - swung)[inner], turned.reshape(-1, 3, 3)[inner], 1 / step
 
 
 def by_floor(
-    slam: Trajectory,
-    points_slam: Float[Tensor, "point 3"],
-    standing: Stretch,
-    height_m: float,
-    height_std_m: float = 0.005,
-    seed: int = 0,
-) -> _GravityScale:
-    """Scale and vertical from the floor below the path, and the camera's height above it while standing (m).
+    slam: Trajectory, points_slam: Float[Tensor, "point 3"], standing: Stretch, height_m: float, seed: int = 0
+) -> SlamAlignment:
+    """Scale and vertical (`_upright`) from the floor below the path, and the camera's height above it while standing (m).
 
     The floor is the plane with most points below the path (RANSAC, then total least squares), at most 35° from the
-    camera's mean level. Standard deviations by a bootstrap over patches of the floor, with `height_std_m` of the
-    measured height. Raises WearcapError when too few points lie on a plane, or for an implausible height.
+    camera's mean level. Standard deviations by a bootstrap over patches of the floor, with 5 mm of the measured
+    height. Raises WearcapError when too few points lie on a plane, or for an implausible height.
     """
     if not 0.5 < height_m < 2.5:
         what = f"a standing height of {height_m} m"
@@ -250,9 +221,9 @@ def by_floor(
         drawn = np.concatenate([members[k] for k in random.integers(0, len(members), len(members))])
         up_k, height_k = _plane(floor[drawn], eyes)
         turns.append(math.acos(min(up @ up_k, 1.0)))
-        scales.append((height_m + height_std_m * random.standard_normal()) / height_k)
-    deviation = math.degrees(math.sqrt(np.mean(np.square(turns))))
-    return _GravityScale(_upright(up), height_m / height, float(np.std(scales)), deviation)
+        scales.append((height_m + 0.005 * random.standard_normal()) / height_k)
+    scale = height_m / height
+    return _upright(up, scale, float(np.std(scales)) / scale, math.sqrt(np.mean(np.square(turns))))
 
 
 def _floor_points(points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -286,5 +257,9 @@ def _plane(points: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, float]:
     return (normal, height) if height > 0 else (-normal, -height)
 
 
-def _upright(up: np.ndarray) -> Float64[Tensor, "3 3"]:
-    return swing_between(torch.from_numpy(up.copy()), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+def _upright(up: np.ndarray, scale: float, scale_std: float, gravity_std: float) -> SlamAlignment:
+    """The least turn that puts z up, so that the heading stays the SLAM's, about its origin; deviations as a share and in
+    rad."""
+    R = swing_between(torch.from_numpy(up.copy()), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    deviations = {"scale_std": scale_std, "gravity_std_deg": math.degrees(gravity_std)}
+    return SlamAlignment(float(scale), R, torch.zeros(3, dtype=torch.float64), **deviations)

@@ -84,8 +84,8 @@ def fuse_paths(
     for scale_m in POSITION_SCALES:
         heading = state[:, 3]
         turned = _turned(path, np.interp(at, nodes, heading))
-        apart = camera.position.numpy() - _columns(times, at, turned)
-        steps = np.diff(_columns(nodes, at, turned), axis=0)
+        apart = camera.position.numpy() - columns_at(times, at, turned)
+        steps = np.diff(columns_at(nodes, at, turned), axis=0)
         deviation = np.hypot(prior.step_m, prior.step_scale * np.linalg.norm(steps, axis=1))
         lead = np.interp(times, nodes, heading)
         off = np.remainder(camera.yaw.numpy() - lead - mount_yaw + np.pi, 2 * np.pi) - np.pi
@@ -102,7 +102,7 @@ def fuse_paths(
         state, mount_yaw = solution[:-1].reshape(count, STATE), solution[-1]
         residual = (rows @ solution).reshape(-1, 3) - values[: 3 * (count - 1)].reshape(-1, 3)
     yaw = np.interp(at, nodes, state[:, 3])
-    return torch.from_numpy(yaw), torch.from_numpy(_turned(path, yaw) + _columns(at, nodes, state[:, :3]))
+    return torch.from_numpy(yaw), torch.from_numpy(_turned(path, yaw) + columns_at(at, nodes, state[:, :3]))
 
 
 def _cauchy(residual: Float[np.ndarray, "row"]) -> Float[np.ndarray, "row"]:
@@ -110,10 +110,10 @@ def _cauchy(residual: Float[np.ndarray, "row"]) -> Float[np.ndarray, "row"]:
     return 1 / (1 + residual**2) ** 2
 
 
-def _columns(
+def columns_at(
     at: Float[np.ndarray, "sample"], times: Float[np.ndarray, "time"], value: Float[np.ndarray, "time axis"]
 ) -> Float[np.ndarray, "sample axis"]:
-    """Linear interpolation of each axis."""
+    """Linear interpolation of each axis; the ends are repeated outside."""
     return np.stack([np.interp(at, times, column) for column in value.T], 1)
 
 

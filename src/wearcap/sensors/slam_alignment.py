@@ -39,32 +39,19 @@ class SceneEvidence:
     up: Float[Tensor, "3 3"] | None = None
     """Rotation to a world with z up where the vertical is known."""
 
-    @property
-    def by_floor(self) -> bool:
-        """Whether the floor can be found: points, and a stretch of standing at a measured height."""
-        return self.points_slam is not None and self.standing is not None and self.camera_height_m is not None
-
     def align(self, slam: Trajectory) -> SlamAlignment:
         """Similarity to a world with z up whose floor, where it is known, is z = 0 and whose heading stays the SLAM's.
 
         The vertical comes from the head's sensor, else the floor, else `up`; the scale from walks, else with the vertical.
         Raises WearcapError where scale or vertical stay unknown, and as the estimators do.
         """
-        R, scale, scale_std, gravity_std_deg = self.up, self.scale, None, None
+        found, spread = None, None
         if self.head_imu is not None:
-            T = self.T_cam_imu
-            found = by_head_imu(slam, self.head_imu, *((None, None) if T is None else (T.R, T.t)))
-        elif self.by_floor:
-            assert self.points_slam is not None
-            assert self.standing is not None
-            assert self.camera_height_m is not None
+            found = by_head_imu(slam, self.head_imu, self.T_cam_imu)
+        elif self.points_slam is not None and self.standing is not None and self.camera_height_m is not None:
             found = by_floor(slam, self.points_slam, self.standing, self.camera_height_m)
-        else:
-            found = None
-        if found is not None:
-            R, gravity_std_deg = found.R_world_slam, float(found.gravity_std_deg)
-            scale, scale_std = float(found.scale), float(found.scale_std / found.scale)
-        spread = None
+        R, scale = (self.up, self.scale) if found is None else (found.R_world_slam, found.scale)
+        scale_std = found and found.scale_std
         if self.walks:
             scale, spread = scale_by_walks(slam, self.walks)
             scale_std = None
@@ -80,7 +67,7 @@ class SceneEvidence:
             self._origin(slam, placed),
             scale_spread=spread,
             scale_std=scale_std,
-            gravity_std_deg=gravity_std_deg,
+            gravity_std_deg=found and found.gravity_std_deg,
         )
 
     def _origin(self, slam: Trajectory, placed: Tensor) -> Tensor:

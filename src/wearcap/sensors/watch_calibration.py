@@ -35,7 +35,7 @@ from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matr
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.recording.recording import FloorTrack, HeadStream, ImuStream, PointCloud, Recording
 from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
-from wearcap.sensors.clock import Clock, SwingClock, fit_swing_clock, swing_peaks
+from wearcap.sensors.clock import Clock, fit_swing_clock, swing_peaks
 from wearcap.sensors.stillness import StepCheck, Stretch, during, require, still_intervals, unstillness_deg
 from wearcap.sensors.watches import require_sides
 
@@ -215,7 +215,7 @@ class WornCalibration:
     """Result of a guided calibration; what was not calibrated is None or absent."""
 
     watches: dict[str, WatchCalibration]
-    clocks: dict[str, SwingClock] = field(default_factory=dict)
+    clocks: dict[str, Clock] = field(default_factory=dict)
     """Clock relation of the camera and each watch."""
     camera: SlamAlignment | None = None
     head: HeadMount | None = None
@@ -257,16 +257,14 @@ class WatchSession:
 
     def swing_clock(
         self, watch: ImuStream, seen_s: Float64[Tensor, "swing"], stretch: Stretch, camera_fps: float
-    ) -> SwingClock:
+    ) -> Clock:
         """Clock relation of the camera and one calibrated watch, from times (s) at which the camera saw the swings.
 
         `stretch` is the part (s) of the watch's log with the swings. Raises WearcapError as `fit_swing_clock` does.
         """
         peaks = swing_peaks(watch, stretch) - self.watch_zero
-        found = fit_swing_clock(seen_s, peaks, 1 / camera_fps)
-        clock = found.clock
-        clock = replace(clock, camera_s=clock.camera_s + self.camera_zero, suit_s=clock.suit_s + self.watch_zero)
-        return SwingClock(clock, found.std_s)
+        clock = fit_swing_clock(seen_s, peaks, 1 / camera_fps)
+        return replace(clock, camera_s=clock.camera_s + self.camera_zero, suit_s=clock.suit_s + self.watch_zero)
 
     def added_to(
         self, recording: Recording, found: WornCalibration, points_slam: Float[Tensor, "point 3"] | None = None
@@ -278,7 +276,7 @@ class WatchSession:
         """
         imu = {joint: found.watches[joint].apply(stream) for joint, stream in self.watches.items()}
         for joint, clock in found.clocks.items():
-            imu[joint] = replace(imu[joint], timestamps=clock.clock.to_camera(self.watches[joint].timestamps))
+            imu[joint] = replace(imu[joint], timestamps=clock.to_camera(self.watches[joint].timestamps))
         recording = replace(recording, imu=recording.imu | imu)
         if self.slam is None or found.camera is None or found.head is None:
             return recording
@@ -332,11 +330,11 @@ def write_watch_calibration(
         "watches": {joint: _row(one, _WATCH) for joint, one in found.watches.items()},
         "clocks": {
             joint: {
-                "camera_s": one.clock.camera_s.tolist(),
-                "watch_s": one.clock.suit_s.tolist(),
-                "swings": one.clock.claps,
-                "drift_s_per_hour": one.clock.drift_s_per_hour,
-                "residual_s": one.clock.residual_s,
+                "camera_s": one.camera_s.tolist(),
+                "watch_s": one.suit_s.tolist(),
+                "swings": one.claps,
+                "drift_s_per_hour": one.drift_s_per_hour,
+                "residual_s": one.residual_s,
                 "std_s": one.std_s,
             }
             for joint, one in found.clocks.items()
@@ -389,12 +387,12 @@ def read_watch_calibration(path: str | Path) -> WornCalibration:
         return WornCalibration(watches, clocks, camera, head)
 
 
-def _clock(row: dict[str, Any]) -> SwingClock:
+def _clock(row: dict[str, Any]) -> Clock:
     knots = [torch.tensor([float(value) for value in row[key]], dtype=torch.float64) for key in ("camera_s", "watch_s")]
     if not len(knots[0]) or len(knots[0]) != len(knots[1]) or not bool(torch.cat(knots).isfinite().all()):
         raise ValueError("a clock without knots")
-    drift, residual = float(row["drift_s_per_hour"]), float(row["residual_s"])
-    return SwingClock(Clock(*knots, drift, residual, int(row["swings"])), float(row["std_s"]))
+    drift, residual, std = (float(row[name]) for name in ("drift_s_per_hour", "residual_s", "std_s"))
+    return Clock(*knots, drift, residual, int(row["swings"]), std)
 
 
 def _tensors(row: dict[str, Any], names: Sequence[str], dtype: torch.dtype) -> list[Tensor]:

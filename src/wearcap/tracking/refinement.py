@@ -10,12 +10,13 @@ from math import ceil
 from typing import Any, NamedTuple
 
 import torch
+from einops import rearrange, reduce
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations, site_positions
 from wearcap.body.retarget import reach
-from wearcap.body.skeleton import FEET, FOOT_PATCHES, WRISTS, Skeleton
+from wearcap.body.skeleton import FEET, FOOT_PATCHES, SIDES, WRISTS, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -25,7 +26,6 @@ from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.foot_lock import FootLock, FootState, displacements
 from wearcap.tracking.head_path import HeadPath
 
-SIDES = ("left", "right")
 _REACH = 2.5
 """Half width of the filter in standard deviations."""
 _STRAIGHT, _SOFT = 0.97, 0.025
@@ -174,7 +174,7 @@ class Refiner:
             weights = weights / weights.sum(1, keepdim=True)
             near = self._values[frames.clamp(0, len(self._values) - 1)]
             mean = torch.einsum("tk,tkv->tv", weights, near)
-            R = rotation.matrix_from_rot6d(mean[:, :-3].unflatten(-1, (-1, 6)))
+            R = rotation.matrix_from_rot6d(rearrange(mean[:, :-3], "time (joint six) -> time joint six", six=6))
             smooth = replace(motion, R_parent_joint=R, t_world_root=mean[:, -3:] + measured.t_world_head)
         self._values = self._values[max(before + count - half, 0) :]
         if self.anchored:
@@ -184,8 +184,9 @@ class Refiner:
     def _offsets(self, motion: Motion, measured: Measured, count: int) -> Float[Tensor, "time foot 3"] | None:
         if self._feet is None or motion.contact_prob is None:
             return None
-        points = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES).unflatten(1, (FEET, -1))
-        prob = motion.contact_prob.unflatten(1, (FEET, -1)).amax(-1)
+        points = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES)
+        points = rearrange(points, "time (foot patch) xyz -> time foot patch xyz", foot=FEET)
+        prob = reduce(motion.contact_prob, "time (foot patch) -> time foot", "max", foot=FEET)
         offsets, self._states = displacements(
             self._feet, points, prob, measured.floor_height, self.fps, self._states, count
         )

@@ -13,6 +13,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import exp
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.motion import Motion
+from wearcap.scene.objects import SceneObject
 from wearsim.people.track import ease
 
 Vector = tuple[float, float, float]
@@ -34,6 +35,21 @@ def vector(values: Float[np.ndarray, "3"]) -> Vector:
 
 WANDER_HZ = (0.15, 0.8)
 """Range of the frequencies of the waves in the paths of hands that are not held."""
+
+
+@dataclass(frozen=True, eq=False)
+class Handled:
+    """An object of a flat with what hands need to know of it."""
+
+    object: SceneObject
+
+    @property
+    def name(self) -> str:
+        return self.object.name
+
+    @property
+    def category(self) -> str:
+        return self.object.category
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ in gesturing. Rarely they go just as if they touched.
 """
 
 from dataclasses import replace
+from itertools import cycle, repeat
 
 import numpy as np
 import torch
@@ -68,20 +69,18 @@ def _handle_copy(plan: Plan, house: House, rng: np.random.Generator, item: Movab
             copy = replace(copy, object=replace(copy.object, name=COPY))
             other = _with(house, InteractiveFlat(flat.static, (*flat.movables, copy), flat.openables))
             act = rearrange if item.rails else relocate
-            if act(plan, other, rng, copy, "move"):
-                while free_hands_s(plan, house) < until and act(plan, other, rng, copy, "move"):
-                    pass
-                return True
+            uses = (act(plan, other, rng, copy, "move") for _ in repeat(None))
         else:
             copy = _moved(item, place)
             other = _with(house, InteractiveFlat(flat.static, flat.movables, (*flat.openables, copy)))
             ends = copy.closed, copy.closed + rng.uniform(0.5, 0.98) * (copy.opened - copy.closed)
             start, stop = ends if rng.random() < 0.5 else ends[::-1]
             other.values[COPY], handle = start, int(rng.integers(len(copy.handles)))
-            if operate(plan, other, rng, copy, stop, handle, "move"):
-                while free_hands_s(plan, house) < until and operate(plan, other, rng, copy, start, handle, "move"):
-                    start, stop = stop, start
-                return True
+            uses = (operate(plan, other, rng, copy, value, handle, "move") for value in cycle((stop, start)))
+        if next(uses):
+            while free_hands_s(plan, house) < until and next(uses):
+                pass
+            return True
     return False
 
 

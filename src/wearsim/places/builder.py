@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.mesh import Mesh, merged
 from wearsim.places import world as w
 from wearsim.places.outline import Box, middle_and_size, rectangle, turn
 
@@ -245,13 +245,11 @@ class WorldBuilder:
 
     def mesh(self) -> Mesh:
         """All triangles so far, in the world."""
-        vertices, faces, colors, _, _ = zip(*self._triangles)
-        counts = np.array([len(corners) for corners in vertices])
-        starts = np.concatenate([[0], counts.cumsum()[:-1]])
-        return Mesh(
-            np.concatenate(vertices).astype(np.float32),
-            np.concatenate([each + start for each, start in zip(faces, starts)]).astype(np.int32),
-            np.repeat(np.array(colors, np.float32), counts, axis=0),
+        return merged(
+            [
+                Mesh(vertices.astype(np.float32), faces.astype(np.int32), np.array(color, np.float32))
+                for vertices, faces, color, *_ in self._triangles
+            ]
         )
 
 

@@ -15,7 +15,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh, merged
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
-from wearsim.handling.grips import SKIN_M, GripPlace, Vector, vector
+from wearsim.handling.grips import SKIN_M, GripPlace, Handled, Vector, vector
 from wearsim.places.builder import Color, Part, Piece, entered, hue
 from wearsim.places.furniture import MAKERS, wood
 from wearsim.places.outline import rectangle, turn
@@ -81,10 +81,9 @@ class _Grasp:
 
 
 @dataclass(frozen=True, eq=False)
-class Movable:
+class Movable(Handled):
     """An object to be moved by hand; its own axes have the front at +x, the origin on the floor below its middle."""
 
-    object: SceneObject
     half_size: tuple[float, float]
     """Half size of the footprint along the object's x and y (m)."""
     height: float
@@ -94,14 +93,6 @@ class Movable:
     """Options for lifting it between both hands: the left and right palm's places and the holder's relative heading."""
     grasps: tuple[_Grasp, ...] = ()
     """Options for lifting it with one hand."""
-
-    @property
-    def name(self) -> str:
-        return self.object.name
-
-    @property
-    def category(self) -> str:
-        return self.object.category
 
     @property
     def outline(self) -> Float[np.ndarray, "4 2"]:

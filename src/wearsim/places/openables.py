@@ -15,7 +15,7 @@ from jaxtyping import Float
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
-from wearsim.handling.grips import SKIN_M, GripPlace, vector
+from wearsim.handling.grips import SKIN_M, GripPlace, Handled, vector
 from wearsim.places.builder import Part, Piece, hue
 from wearsim.places.furniture import PATTERNED, PLAIN, parts_of, wood
 
@@ -36,10 +36,9 @@ FloorPoint = Callable[[tuple[float, float]], Float[np.ndarray, "3"]]
 
 
 @dataclass(frozen=True, eq=False)
-class Openable:
+class Openable(Handled):
     """A hinged or sliding object with handles. Values are those of `Freedom`: 0 is the initial pose."""
 
-    object: SceneObject
     outline: Float[np.ndarray, "4 2"]
     """Outline from above, in its own axes, counter-clockwise (m)."""
     z_range: tuple[float, float]
@@ -48,14 +47,6 @@ class Openable:
     closed: float
     opened: float
     """Value at the limit of its opening."""
-
-    @property
-    def name(self) -> str:
-        return self.object.name
-
-    @property
-    def category(self) -> str:
-        return self.object.category
 
     @property
     def hinged(self) -> bool:

@@ -56,15 +56,6 @@ class Protocol:
 
 
 @dataclass(frozen=True)
-class _SimulatedSession:
-    """A motion with its stretches at the spot ("stand" and "move") and the times of its claps (s)."""
-
-    simulated: SimulatedMotion
-    intervals: Intervals
-    claps_s: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class HpsConfig(HeadCameraConfig):
     """Settings of a simulated recording."""
 
@@ -86,10 +77,11 @@ class HpsConfig(HeadCameraConfig):
 
 @dataclass(frozen=True)
 class Simulated:
-    """A recording, and the world and session that it was made from."""
+    """A recording, and the motion, with its claps, and world that it was made from."""
 
     recording: Recording
-    session: _SimulatedSession
+    motion: SimulatedMotion
+    claps_s: list[float]
     world: World
     clock: tuple[float, float]
     """Clock of the camera: its lead over the suit's at the suit's zero (s), and its drift (ms per hour)."""
@@ -109,14 +101,15 @@ def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: Wor
     rng = seeded(5, split, seed)
     person = drawn_person(split, rng)
     world = world or world_of(split, seed % min(SITES[split], POOLS[split][1]), "site")
-    session = _Session(world, person, rng, config.protocol).simulated(config.fps)
-    motion = session.simulated.motion
-    suit = suit_motion(motion, session.simulated.contact, config.suit, rng)
-    strength = rng.uniform(*config.clap_acc, len(session.claps_s))
+    session = _Session(world, person, rng, config.protocol)
+    simulated, intervals = session.simulated(config.fps)
+    motion, claps_s = simulated.motion, session.clap_times
+    suit = suit_motion(motion, simulated.contact, config.suit, rng)
+    strength = rng.uniform(*config.clap_acc, len(claps_s))
     imu = {}
     for side in SIDES:
         stream = synthesize_imu(motion, f"{side}_wrist", noise=config.imu, rng=rng, n=1)
-        imu[f"{side}_wrist"] = _shaken_by_claps(stream, motion, session.claps_s, strength)
+        imu[f"{side}_wrist"] = _shaken_by_claps(stream, motion, claps_s, strength)
     camera, path, clock = head_camera(motion, person.t_head_device, config, rng)
     localization = None
     if config.localization is not None:
@@ -124,13 +117,13 @@ def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: Wor
         localization = localize_statistically(path, config.localization, rng, texture)
         suit = by_gravity(suit, config.localization.map, rng)
     about = {
-        "claps_s": " ".join(f"{time:.4f}" for time in session.claps_s),
+        "claps_s": " ".join(f"{time:.4f}" for time in claps_s),
         "camera_clock_offset_s": f"{clock[0]:.6f}",
         "camera_clock_drift_ms_per_h": f"{clock[1]:.3f}",
     }
     documented = replace(motion, provenance=motion.provenance | about)
     recording = with_truth(
-        replace(session.simulated, motion=documented),
+        replace(simulated, motion=documented),
         person,
         name,
         world.name,
@@ -140,12 +133,12 @@ def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: Wor
         camera=camera,
         localization=localization,
         object_motion={HEAD_CAMERA_TRUTH: path},
-        intervals=session.intervals,
+        intervals=intervals,
     )
-    return Simulated(recording, session, world, clock)
+    return Simulated(recording, simulated, claps_s, world, clock)
 
 
-def _shaken_by_claps(stream: ImuStream, motion: Motion, claps_s: tuple[float, ...], strength: np.ndarray) -> ImuStream:
+def _shaken_by_claps(stream: ImuStream, motion: Motion, claps_s: list[float], strength: np.ndarray) -> ImuStream:
     """Readings of a wrist's sensor; palms that meet push the wrists apart for some hundredths of a second."""
     own, other = (f"{side}_wrist" for side in (SIDES if stream.joint == "left_wrist" else SIDES[::-1]))
     apart = motion.joint(own).t - motion.joint(other).t
@@ -177,8 +170,8 @@ class _Session:
         self.clap_times: list[float] = []
         self._length_home = world.navigation.lengths_from(self.home)
 
-    def simulated(self, fps: float) -> _SimulatedSession:
-        """The whole session, at the world's first capture spot."""
+    def simulated(self, fps: float) -> tuple[SimulatedMotion, Intervals]:
+        """The whole session, at the world's first capture spot, and its stretches there ("stand" and "move")."""
         self.visit()
         for distance in self.protocol.returns_m:
             self.wander(distance)
@@ -196,13 +189,8 @@ class _Session:
         path_so_far = simulated.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).cumsum(0).numpy()
         starts, stops, names = zip(*self.stretches)
         travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], path_so_far)
-        intervals = Intervals(
-            torch.tensor(starts, dtype=torch.float64),
-            torch.tensor(stops, dtype=torch.float64),
-            torch.from_numpy(travelled).float(),
-            names,
-        )
-        return _SimulatedSession(simulated, intervals, tuple(self.clap_times))
+        spans = (torch.tensor(ends, dtype=torch.float64) for ends in (starts, stops))
+        return simulated, Intervals(*spans, torch.from_numpy(travelled).float(), names)
 
     def walk(self, goal: np.ndarray, heading: float | None = None) -> bool:
         path = self.world.plan_path(self.plan.position, goal, self.rng)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.errors import WearcapError
+from wearcap.errors import require_choice
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.motion import Motion
@@ -65,8 +65,7 @@ class LocalizationNoise:
     @classmethod
     def preset(cls, name: str) -> "LocalizationNoise":
         """Localisation "ideal", "typical" or "poor". Raises WearcapError for another name."""
-        if name not in LOCALIZATIONS:
-            raise WearcapError(f"localization={name!r}", expected=f"one of {', '.join(LOCALIZATIONS)}")
+        require_choice(name, LOCALIZATIONS, f"localization={name!r}")
         return LOCALIZATIONS[name]
 
 
@@ -131,7 +130,8 @@ def localize_statistically(
     # A view has more matches or fewer; with fewer, larger errors are to be expected.
     quality = slow[:, 6]
     if texture is not None:
-        quality = (quality + _normal_rank(texture)) / np.sqrt(2)
+        rank = texture.argsort().argsort().double().numpy()
+        quality = (quality + scipy.stats.norm.ppf((rank + 0.5) / count)) / np.sqrt(2)
     expected = scale * torch.from_numpy(np.exp(-EXPECTED_ERROR * quality))[:, None]
     lasting = np.sqrt(noise.lasting) * torch.from_numpy(slow[:, :6]).float()
     error = expected * (lasting + np.sqrt(1 - noise.lasting) * quick)
@@ -168,12 +168,6 @@ def without(found: Localization, lost: Bool[Tensor, "time"]) -> Localization:
         confidence=torch.where(lost, torch.zeros(()), found.confidence),
         covariance=covariance,
     )
-
-
-def _normal_rank(value: Float[Tensor, "time"]) -> np.ndarray:
-    """Standard normal deviates of the same order."""
-    rank = value.argsort().argsort().double().numpy()
-    return scipy.stats.norm.ppf((rank + 0.5) / len(rank))
 
 
 def _bend(path: Trajectory, errors: MapErrors, rng: np.random.Generator) -> Float[Tensor, "time 3"]:

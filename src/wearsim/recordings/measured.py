@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 
 from wearcap.geometry import rotation
 from wearcap.scene.objects import Environment, SceneObject
@@ -33,20 +32,8 @@ def _measured(item: SceneObject, errors: EnvironmentErrors, rng: np.random.Gener
     drawn = rng.standard_normal(6) / np.sqrt([2, 2, 1, 1, 2, 2])
     shift = torch.from_numpy(drawn[:3] * [errors.position_m, errors.position_m, errors.height_m])
     turn = rotation.about_axis("z", torch.tensor(np.deg2rad(errors.angle_deg) * drawn[3]))
-
-    def moved(point: Float64[torch.Tensor, "3"]) -> Float64[torch.Tensor, "3"]:
-        return middle + shift + turn @ (point - middle)
-
-    freedom = item.freedom
-    if freedom.pivot is not None:
-        pivot = moved(torch.tensor(freedom.pivot, dtype=torch.float64))
-        off = torch.tensor([*errors.hinge_m * drawn[4:], 0.0], dtype=torch.float64)
-        freedom = replace(freedom, pivot=tuple((pivot + off).tolist()))
-    if freedom.axis is not None:
-        freedom = replace(freedom, axis=tuple((turn @ torch.tensor(freedom.axis, dtype=torch.float64)).tolist()))
-    return replace(
-        item,
-        R_world_object=(turn @ item.R_world_object.double()).to(item.R_world_object),
-        t_world_object=moved(item.t_world_object.double()).to(item.t_world_object),
-        freedom=freedom,
-    )
+    measured = item.displaced(turn, middle, middle + shift)
+    if measured.freedom.pivot is None:
+        return measured
+    pivot = np.array(measured.freedom.pivot) + np.array([*errors.hinge_m * drawn[4:], 0.0])
+    return replace(measured, freedom=replace(measured.freedom, pivot=tuple(pivot.tolist())))

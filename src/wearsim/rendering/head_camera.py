@@ -1,6 +1,6 @@
 """The camera on a simulated wearer's head: its mount, its clock, the texture it sees, and its video with sound."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -92,7 +92,7 @@ def view_texture(world: World, path: Trajectory, every: int = 15) -> Float[Tenso
     seen = np.empty(len(frames))
     R, t = path.R_world_body.double().numpy(), path.t_world_body.double().numpy()
     for row, frame in enumerate(frames):
-        nearness, index = np.full(GLANCE_PX, -np.inf, np.float32), np.full(GLANCE_PX, -1, np.int32)
+        nearness, index = raster.empty_buffers(*GLANCE_PX)
         vertices = (world.mesh.vertices - t[frame]) @ R[frame]
         raster.draw_pinhole(vertices, world.mesh.faces, *GLANCE, NEAR_M, nearness, index)
         seen[row] = grade[index].mean()
@@ -159,7 +159,10 @@ def write_head_video(
         stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
         sound = container.add_stream("aac", rate=SOUND_HZ, layout="mono")
         first, last = times[0].item(), times[-1].item()
-        for piece in _audio_frames(sound_track(last - first + 0.1, [clap - first for clap in claps_s], rng)):
+        wave = sound_track(last - first + 0.1, [clap - first for clap in claps_s], rng)
+        for start in range(0, len(wave), 1024):
+            piece = av.AudioFrame.from_ndarray(wave[None, start : start + 1024].copy(), "fltp", "mono")
+            piece.rate, piece.pts = SOUND_HZ, start
             container.mux(sound.encode(piece))
         container.mux(sound.encode(None))
         for picture in film(scenery, camera, path, times, filming, rng):
@@ -206,11 +209,3 @@ def _add(wave: np.ndarray, at_s: float, piece: np.ndarray) -> None:
     start = round(at_s * SOUND_HZ)
     if 0 <= start < len(wave):
         wave[start : start + len(piece)] += piece[: len(wave) - start]
-
-
-def _audio_frames(wave: np.ndarray) -> Iterator[av.AudioFrame]:
-    """Pieces of 1,024 samples for an encoder."""
-    for start in range(0, len(wave), 1024):
-        piece = av.AudioFrame.from_ndarray(wave[None, start : start + 1024].copy(), "fltp", "mono")
-        piece.rate, piece.pts = SOUND_HZ, start
-        yield piece

@@ -150,8 +150,7 @@ class Lens:
 
 def visible(scenery: Scenery, R: np.ndarray, t: np.ndarray, view: View) -> tuple[np.ndarray, np.ndarray]:
     """Nearness (1/m) and face of every sample of a view; -1 without a face."""
-    nearness = np.full((view.height, view.width), -np.inf, np.float32)
-    index = np.full((view.height, view.width), -1, np.int32)
+    nearness, index = raster.empty_buffers(view.height, view.width)
     vertices = (scenery.vertices - t) @ R
     raster.draw_pinhole(vertices, scenery.faces, view.focal, view.focal, view.cx, view.cy, NEAR_M, nearness, index)
     return nearness, index

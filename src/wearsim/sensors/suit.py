@@ -12,12 +12,13 @@ import scipy.ndimage
 import scipy.signal
 import scipy.stats
 import torch
+from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, local_rotations, site_positions
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
-from wearcap.errors import WearcapError
+from wearcap.errors import require_choice
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.motion import Motion
@@ -96,8 +97,7 @@ class SuitNoise:
     @classmethod
     def preset(cls, name: str) -> "SuitNoise":
         """Errors of a suit "ideal", "typical" or "poor". Raises WearcapError for another name."""
-        if name not in SUITS:
-            raise WearcapError(f"suit={name!r}", expected=f"one of {', '.join(SUITS)}")
+        require_choice(name, SUITS, f"suit={name!r}")
         return SUITS[name]
 
 
@@ -183,7 +183,8 @@ def _orientations(motion: Motion, errors: SegmentErrors, rng: np.random.Generato
     """World orientations of the segments with errors of calibration, fusion and soft tissue, before the heading's."""
     length, joints, fps = len(motion), len(motion.skeleton), motion.fps
     fixed = torch.from_numpy(rng.standard_normal((1, joints, 3))).float()
-    slow = smooth_noise(rng, length, joints * 3, errors.slow_period_s, fps).unflatten(-1, (joints, 3))
+    slow = smooth_noise(rng, length, joints * 3, errors.slow_period_s, fps)
+    slow = rearrange(slow, "time (joint xyz) -> time joint xyz", xyz=3)
     T_world_joint = motion.T_world_joint
     sideways, axis = torch.nn.functional.normalize(
         torch.from_numpy(rng.standard_normal((2, joints, 3))).float(), dim=-1
