@@ -7,13 +7,13 @@ from einops import rearrange
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from benchmarks.rivals.pose_regression.features import TrackedPoints, pasts
+from benchmarks.rivals.pose_regression.net import PoseRegressor
+from benchmarks.rivals.pose_regression.pipeline import PoseRegressorCapture
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
-from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, pasts
-from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
 from wearcap.systems.hmd2.training_windows import HeadWindow
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 from wearcap.training.losses import joint_velocity, masked_mean

@@ -6,14 +6,14 @@ from itertools import pairwise
 
 import torch
 
+from benchmarks.rivals.pose_regression.features import TrackedPoints, pasts
+from benchmarks.rivals.pose_regression.net import PoseRegressor
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
-from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, pasts
 from wearcap.tracking.anchor import anchored_to_head, with_hand_moved
 from wearcap.tracking.head_path import head_path
 

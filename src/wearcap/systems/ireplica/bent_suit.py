@@ -12,7 +12,7 @@ from wearcap.recording.timing import resampled
 from wearcap.sensors.initialization import align_suit, body_camera, inliers
 from wearcap.systems.hps.camera import Localize, MapLocalization, Synchronization
 from wearcap.systems.hps.pipeline import required
-from wearcap.systems.hps.published import PlacedSuit
+from wearcap.systems.hps.placed_suit import PlacedSuit
 from wearcap.systems.ireplica.trajectory import BentPath
 
 
