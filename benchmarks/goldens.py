@@ -96,7 +96,11 @@ CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
     **{f"hps_{kind}": (None, "hps", (*SHARED, f"pipeline.kind={kind}")) for kind in SUIT_ROWS},
     "bent_suit": (None, "hps", SHARED),
     "ireplica": ("contact_sequence", "flats", ()),
-    "ireplica_without_correction": ("contact_sequence", "flats", ()),
+    "ireplica_without_correction": (
+        "contact_sequence",
+        "flats",
+        ("pipeline.tracker.correction=null", "pipeline.tracker.hands=null"),
+    ),
     "ireplica_paper": ("[contact_transformer_sliding,contact_transformer_hinged]", "flats", ()),
     "pose_regressor": ("runs/pose_regressor_hands/checkpoints/last.ckpt", "walkers", ()),
 }
@@ -115,7 +119,7 @@ PIPELINES = {
     "hps_without_scene": "paper/hps_without_scene",
     **{f"hps_{kind}": "baseline/hps_suit" for kind in SUIT_ROWS},
     "bent_suit": "paper/bent_suit",
-    "ireplica_without_correction": "ablation/ireplica_without_correction",
+    "ireplica_without_correction": "ireplica",
     "ireplica_paper": "paper/ireplica",
 }
 """Pipeline configs of the captures that are not named after theirs."""

@@ -1,1 +1,1 @@
-"""Data sets: a file for each that is read and prepared in its own way; `wearcap prepare NAME` runs it by `conf/prepare/`."""
+"""Data sets: a file for each that is read and prepared in its own way; `wearcap prepare NAME` calls NAME_tasks, whose arguments are its settings."""

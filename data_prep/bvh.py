@@ -1,4 +1,4 @@
-"""BVH and ASF/AMC files of any origin; ACCAD, Berkeley MHAD, FuBoT-VR and HDM05 are configs of it."""
+"""BVH or ASF/AMC files of any origin: names, unit, axes and rest pose are detected."""
 
 import re
 import warnings
@@ -20,7 +20,7 @@ from wearcap.prepare.foreign_conventions import Mapping, read_mapping
 from wearcap.prepare.foreign_files import Take, asf_beside
 from wearcap.prepare.hips import find_shift, with_shift
 from wearcap.prepare.levels import Levels, levels_in
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
+from wearcap.prepare.mocap import MOCAP, About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
 VERSION = 3
@@ -93,17 +93,22 @@ def _of_subject(
 
 
 def bvh_tasks(
-    source: str | Path,
+    source: str | Path,  # a file, or a folder (searched as deep as it goes)
     splits: Splits,
-    settings: MocapSettings,
-    amc_fps: float | int,
-    license: str,
-    hips: Hips,
-    mapping: str | Path | None = None,
-    subject: str | None = None,
-    activity: str | None = None,
-    unit: str | float | int = AUTO,
-    up: str = AUTO,
+    settings: MocapSettings = MOCAP,
+    amc_fps: float | int = 120,  # not in AMC files
+    license: str = "unknown",  # kept in every recording: say whose data it is
+    repair: bool = False,  # true moves the hip joints so that knees straighten as people's do, per person
+    usual_m: Sequence[float] = (
+        0.0,
+        0.0,
+    ),  # the hips' usual shift ahead and up (m), for people who neither walk nor stand
+    mapping: str | Path | None = None,  # a YAML file that overrides what is detected: joints, unit, up, forward
+    subject: str
+    | None = None,  # null: the number in SUBJECT_TRIAL, else the folder; or a pattern with one group, folder, a name
+    activity: str | None = None,  # null: none; or a pattern with one group, folder, a name
+    unit: str | float | int = AUTO,  # of length: m, cm, mm, inch …, or metres per unit
+    up: str = AUTO,  # the axis that is up: x, y, z, -x, -y, -z
 ) -> list[Task]:
     """One task per .bvh or .amc (also .xz, .gz) that `source` is or that lies anywhere below it, named by its path.
 
@@ -129,7 +134,7 @@ def bvh_tasks(
     abouts = {name: About(name, subjects[name], "bvh", license, activities[name]) for name in trials}
     given, how = Mapping() if mapping is None else read_mapping(mapping), Conventions(unit=unit, up=up)
     given = replace(given, unit_m=how.unit_m or given.unit_m, up=given.up if how.up == AUTO else how.up)
-    return motion_tasks(trials, abouts, splits, settings, amc_fps, given, hips, VERSION)
+    return motion_tasks(trials, abouts, splits, settings, amc_fps, given, Hips(repair, usual_m), VERSION)
 
 
 def motion_files(source: Path) -> list[Path]:

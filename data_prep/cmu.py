@@ -1,4 +1,4 @@
-"""CMU's motion capture: AMC files, or their BVH conversions, named SUBJECT_TRIAL."""
+"""CMU motion capture (ASF/AMC or its BVH conversions), plain, .xz or .gz."""
 
 import csv
 from collections.abc import Sequence
@@ -10,20 +10,31 @@ from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.prepare.engine import Splits, Task, source_folder
 from wearcap.prepare.foreign_conventions import Mapping
-from wearcap.prepare.mocap import About, MocapSettings
+from wearcap.prepare.mocap import MOCAP, About, MocapSettings
 
+LICENSE = (
+    "Free for all uses; the data used in this project was obtained from mocap.cs.cmu.edu. The database was created with "
+    "funding from NSF EIA-0196217."
+)
 VERSION = 5
 """Version of the conversion, increased when the same source and settings yield another recording."""
 
 
 def cmu_tasks(
-    source: str | Path | Sequence[str | Path],
+    source: str
+    | Path
+    | Sequence[str | Path],  # the folder with the trials, or a list of folders (searched as deep as they go)
     splits: Splits,
-    settings: MocapSettings,
-    amc_fps: float | int,
-    license: str,
-    hips: Hips,
-    subject: str | None = None,
+    settings: MocapSettings = MOCAP,
+    amc_fps: float | int = 120,  # not in AMC files
+    license: str = LICENSE,
+    repair: bool = True,  # move the hip joints so that knees straighten as people's do; false keeps the file's
+    usual_m: Sequence[float] = (
+        -0.012,
+        0.013,
+    ),  # the hips' usual shift ahead and up (m), for people who neither walk nor stand
+    subject: str
+    | None = None,  # null: the number in SUBJECT_TRIAL, else the folder; or a pattern with one group, folder, a name
 ) -> list[Task]:
     """One task per trial found anywhere below `source`, a folder or several.
 
@@ -43,7 +54,7 @@ def cmu_tasks(
         trials, subjects = trials | own, subjects | subjects_of(root, own, subject)
         activities |= _activities(root / "index.csv")
     abouts = {name: About(name, subjects[name], "cmu", license, activities.get(name) or "") for name in trials}
-    return motion_tasks(trials, abouts, splits, settings, amc_fps, Mapping(), hips, VERSION)
+    return motion_tasks(trials, abouts, splits, settings, amc_fps, Mapping(), Hips(repair, usual_m), VERSION)
 
 
 def _activities(index: Path) -> dict[str, str | None]:

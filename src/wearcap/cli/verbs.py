@@ -1,6 +1,8 @@
 """The verbs, their help and their one style of arguments, without the imports of a verb: help is there at once."""
 
 import argparse
+import ast
+import importlib.util
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -48,9 +50,24 @@ def conf_dir() -> Path:
     return resource("conf", "conf")
 
 
+GIVEN = ("output", "jobs", "backend", "scheduler", "overwrite")
+"""Settings of a source that all have, from `conf/prepare.yaml`."""
+
+
 def sources() -> dict[str, Path]:
-    """Sources of `prepare` by name: the configs of `conf/prepare/`."""
-    return {path.stem: path for path in sorted((conf_dir() / "prepare").glob("*.yaml"))}
+    """Sources of `prepare` by name: the files of `data_prep/` with a function NAME_tasks or NAME_rework."""
+    found = importlib.util.find_spec("data_prep")
+    folders = [Path(folder) for folder in (found and found.submodule_search_locations) or ()]
+    files = sorted(path for folder in folders for path in folder.glob("*.py"))
+    entry = re.compile(r"^def (\w+)_(?:tasks|rework)\(", re.MULTILINE)
+    return {path.stem: path for path in files if path.stem in entry.findall(path.read_text(encoding="utf-8"))}
+
+
+def entry_of(path: Path) -> ast.FunctionDef:
+    """The function of a source's file whose arguments are its settings: NAME_tasks or NAME_rework."""
+    names = f"{path.stem}_tasks", f"{path.stem}_rework"
+    body = ast.parse(path.read_text(encoding="utf-8")).body
+    return next(node for node in body if isinstance(node, ast.FunctionDef) and node.name in names)
 
 
 def overrides(verb: str, arguments: Sequence[str]) -> list[str]:
@@ -141,35 +158,60 @@ def help_of(verb: str, arguments: Sequence[str]) -> str | None:
         return _help_of_prepare(words)
     config = "calibrate_watches" if verb == "calibrate" and "steps=watches" in arguments else verb
     file = conf_dir() / f"{config}.yaml"
-    return None if words[:1] == ["edit"] or not file.is_file() else _help_of_config(f"wearcap {verb}", [file])
+    return None if words[:1] == ["edit"] or not file.is_file() else _help_of_config(f"wearcap {verb}", file)
 
 
 def _help_of_prepare(words: Sequence[str]) -> str:
     if words and words[0] in sources():
-        return _help_of_config(f"wearcap prepare {words[0]}", [sources()[words[0]], conf_dir() / "prepare.yaml"])
-    rows = [(name, _about(path.read_text(encoding="utf-8"))[0]) for name, path in sources().items()]
-    rows = [(name, textwrap.shorten(text, COLUMNS - 24, placeholder=" …")) for name, text in rows]
+        path = sources()[words[0]]
+        rows = _signature(path) + _help_rows(conf_dir() / "prepare.yaml")[0]
+        return page([_summary(path)], f"wearcap prepare {words[0]}", rows, [f"Settings within others: see {path}."])
+    rows = [
+        (name, textwrap.shorten(_summary(path), COLUMNS - 24, placeholder=" …")) for name, path in sources().items()
+    ]
     return page([VERBS["prepare"]], "wearcap prepare SOURCE", rows, ["wearcap prepare SOURCE --help: its settings."])
+
+
+def _summary(path: Path) -> str:
+    """The first paragraph of a module's docstring."""
+    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n\n")[0]
+
+
+def _signature(path: Path) -> list[tuple[str, str]]:
+    """(key=value, its comment) of a source's settings, as the comments of its function's arguments explain them."""
+    lines, entry = path.read_text(encoding="utf-8").splitlines(), entry_of(path)
+    arguments, rows = [*entry.args.args, *entry.args.kwonlyargs], []
+    defaults = [None] * (len(entry.args.args) - len(entry.args.defaults)) + entry.args.defaults + entry.args.kw_defaults
+    for argument, default in zip(arguments, defaults):
+        comment = lines[argument.lineno - 1].partition("  # ")[2]
+        if comment:
+            value = ast.literal_eval(default) if isinstance(default, ast.Constant | ast.Tuple | ast.List) else None
+            text = str(list(value) if isinstance(value, tuple) else value).replace(" ", "")
+            shown = "…" if value is None else text.lower() if isinstance(value, bool) else text
+            rows.append((f"{argument.arg}={shown}", comment))
+    return rows
 
 
 def _about(text: str) -> list[str]:
     """The comments at the top of a config."""
-    return re.findall(r"^# (?!@)(.*)", re.split(r"^\w", text, maxsplit=1, flags=re.MULTILINE)[0], re.MULTILINE)
+    return re.findall(r"^# (.*)", re.split(r"^\w", text, maxsplit=1, flags=re.MULTILINE)[0], re.MULTILINE)
 
 
-def _help_of_config(command: str, files: Sequence[Path]) -> str:
-    texts = [file.read_text(encoding="utf-8") for file in files]
-    rows, others = [], []
-    for text in texts:
-        shown = True
-        for block in text.split("\nhydra:")[0].split("\n\n"):
-            settings = _settings(block)
-            rows += [(key, note) for key, note in settings if note] if shown else []
-            others += [key.split("=")[0] for key, note in settings if not (shown and note)]
-            shown = shown and not settings
-        rows += _groups(text)
-    more = [f"Also {', '.join(others)}: see {files[0]}."] if others else []
-    return page(_about(texts[0]), command, rows, more)
+def _help_of_config(command: str, file: Path) -> str:
+    rows, others = _help_rows(file)
+    more = [f"Also {', '.join(others)}: see {file}."] if others else []
+    return page(_about(file.read_text(encoding="utf-8")), command, rows, more)
+
+
+def _help_rows(file: Path) -> tuple[list[tuple[str, str]], list[str]]:
+    """Settings of a config up to the first empty line with their texts, and names of the others."""
+    text, rows, others, shown = file.read_text(encoding="utf-8"), [], [], True
+    for block in text.split("\nhydra:")[0].split("\n\n"):
+        settings = _settings(block)
+        rows += [(key, note) for key, note in settings if note] if shown else []
+        others += [key.split("=")[0] for key, note in settings if not (shown and note)]
+        shown = shown and not settings
+    return rows + _groups(text), others
 
 
 def _groups(text: str) -> list[tuple[str, str]]:
@@ -185,7 +227,7 @@ def _settings(block: str) -> list[tuple[str, str]]:
     """(key=value, its comment) of the settings at the top level of a block of YAML; comments go on in lines of their own."""
     found: list[tuple[str, str]] = []
     for line in block.splitlines():
-        if (match := re.match(r"(\w+): *(.*?)(?: +# (.*))?$", line)) and match[1] not in ("defaults", "tasks"):
+        if (match := re.match(r"(\w+): *(.*?)(?: +# (.*))?$", line)) and match[1] != "defaults":
             plain = re.fullmatch(r"[\w.:/-]+|\[.*\]", match[2]) and match[2] != "null"
             value = match[2].replace(" ", "") if plain else "…"
             found.append((f"{match[1]}={value}", match[3] or ""))
