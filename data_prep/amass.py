@@ -32,8 +32,9 @@ def amass_tasks(
     splits: Splits,
     settings: MocapSettings = MOCAP,
     license: str = "AMASS licence (amass.is.tue.mpg.de); not to be passed on",
-    subsets: Sequence[str]
-    | None = None,  # data sets' folders: MocapEvery's are [CMU, MPI_HDM05, BMLmovi], protocol 1's [BioMotionLab_NTroje, CMU, MPI_HDM05]; null: all
+    # data sets' folders: MocapEvery's are [CMU, MPI_HDM05, BMLmovi], protocol 1's [BioMotionLab_NTroje, CMU,
+    # MPI_HDM05]; null: all
+    subsets: Sequence[str] | None = None,
     up: str = AUTO,  # the axis that is up: z as in AMASS, or where somebody clearly stands along another; x, y, z, -x …
 ) -> list[Task]:
     """One task per motion file below `source`, laid out DATASET/SUBJECT/MOTION.npz, of all data sets or of `subsets`;

@@ -34,6 +34,8 @@ from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.prepare.mocap import CleaningLimits, MocapSettings, foot_patches, on_xsens23
 from wearcap.scene.objects import centered, check_object_mesh
 
+BEHAVE = MocapSettings(fps=30, limits=CleaningLimits(level_within=0.2))
+"""Bodies were fitted frame by frame, so planted feet's heights spread further than in motion capture."""
 FPS = 30
 """Frame rate (Hz) of the release that has `smpl_fit_all.npz`; the older release has one frame per second in folders."""
 BODY_FILE, OBJECT_FILE, INFO_FILE = "smpl_fit_all.npz", "object_fit_all.npz", "info.json"
@@ -233,10 +235,6 @@ def _level_behave(root: Path, name: str, settings: MocapSettings) -> OneObject:
         raise WearcapError(what, where=take.name, expected=f"at most {MAX_TILT_DEG:g}°", fix=fix)
     motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
     return replace(take, motion=motion).turned(R)
-
-
-BEHAVE = MocapSettings(fps=30, limits=CleaningLimits(level_within=0.2))
-"""Bodies were fitted frame by frame, so planted feet's heights spread further than in motion capture."""
 
 
 def behave_tasks(

@@ -92,6 +92,44 @@ def _of_subject(
     return levels, siblings, find_shift(motions, usual_m, levels and levels.R_pelvis)
 
 
+VARIANTS = {
+    "accad": {
+        "about": "ACCAD motion capture (BVH, plain, .xz or .gz), in files that are named PERSON_ACTION.",
+        "subject": r"([A-Za-z]+\d+)_",
+        "activity": r"_([A-Za-z]{3,})",
+        "repair": True,
+        "usual_m": (0.0, 0.012),
+        "license": "CC BY 3.0; motion capture data: Advanced Computing Center for the Arts and Design (ACCAD), The Ohio "
+        "State University.",
+    },
+    "berkeley_mhad": {
+        "about": "Berkeley MHAD's skeletons (BVH, plain, .xz or .gz), in files that are named skl_PERSON_ACTION_REPETITION.",
+        "subject": r"skl_(s\d+)_",
+        "activity": r"skl_s\d+_([a-z0-9]+)",
+        "repair": True,
+        "license": "Copyright (c) 2013, The Regents of the University of California. Read the terms on the data set's page "
+        "before sharing what is trained on it.",
+    },
+    "fubot_vr": {
+        "about": "FuBoT-VR: one person in an inertial suit who plays VR games (BVH, plain, .xz or .gz), in files named "
+        "GAME_NUMBER. The split is by game.",
+        "subject": r"([a-z]+)_\d+",
+        "activity": r"([a-z]+)_\d+",
+        "license": "MIT; FuBoT-VR data set, Tomiha, github.com/Tomiha/FuBoT-VR-Dataset.",
+    },
+    "hdm05": {
+        "about": "HDM05 motion capture (ASF/AMC), plain, .xz or .gz, cut into clips named HDM_PERSON_ACTION_NUMBER_120.",
+        "subject": r"HDM_([a-z]+)_",
+        "activity": r"HDM_[a-z]+_([A-Za-z]+)",
+        "repair": True,
+        "usual_m": (-0.012, 0.013),
+        "license": "CC BY-SA 3.0; the data used in this project was obtained from HDM05 (M. Müller, T. Röder, M. Clausen, "
+        "B. Eberhardt, B. Krüger, A. Weber: Documentation Mocap Database HDM05, Universität Bonn, CG-2007-2, 2007).",
+    },
+}
+"""Data sets in these formats: what they are, and settings that have other defaults."""
+
+
 def bvh_tasks(
     source: str | Path,  # a file, or a folder (searched as deep as it goes)
     splits: Splits,
@@ -99,13 +137,11 @@ def bvh_tasks(
     amc_fps: float | int = 120,  # not in AMC files
     license: str = "unknown",  # kept in every recording: say whose data it is
     repair: bool = False,  # true moves the hip joints so that knees straighten as people's do, per person
-    usual_m: Sequence[float] = (
-        0.0,
-        0.0,
-    ),  # the hips' usual shift ahead and up (m), for people who neither walk nor stand
+    # the hips' usual shift ahead and up (m), for people who neither walk nor stand
+    usual_m: Sequence[float] = (0.0, 0.0),
     mapping: str | Path | None = None,  # a YAML file that overrides what is detected: joints, unit, up, forward
-    subject: str
-    | None = None,  # null: the number in SUBJECT_TRIAL, else the folder; or a pattern with one group, folder, a name
+    # null: the number in SUBJECT_TRIAL, else the folder; or a pattern with one group, folder, a name
+    subject: str | None = None,
     activity: str | None = None,  # null: none; or a pattern with one group, folder, a name
     unit: str | float | int = AUTO,  # of length: m, cm, mm, inch …, or metres per unit
     up: str = AUTO,  # the axis that is up: x, y, z, -x, -y, -z

@@ -21,20 +21,17 @@ VERSION = 5
 
 
 def cmu_tasks(
-    source: str
-    | Path
-    | Sequence[str | Path],  # the folder with the trials, or a list of folders (searched as deep as they go)
+    # the folder with the trials, or a list of folders (searched as deep as they go)
+    source: str | Path | Sequence[str | Path],
     splits: Splits,
     settings: MocapSettings = MOCAP,
     amc_fps: float | int = 120,  # not in AMC files
     license: str = LICENSE,
     repair: bool = True,  # move the hip joints so that knees straighten as people's do; false keeps the file's
-    usual_m: Sequence[float] = (
-        -0.012,
-        0.013,
-    ),  # the hips' usual shift ahead and up (m), for people who neither walk nor stand
-    subject: str
-    | None = None,  # null: the number in SUBJECT_TRIAL, else the folder; or a pattern with one group, folder, a name
+    # the hips' usual shift ahead and up (m), for people who neither walk nor stand
+    usual_m: Sequence[float] = (-0.012, 0.013),
+    # null: the number in SUBJECT_TRIAL, else the folder; or a pattern with one group, folder, a name
+    subject: str | None = None,
 ) -> list[Task]:
     """One task per trial found anywhere below `source`, a folder or several.
 

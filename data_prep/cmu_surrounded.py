@@ -68,10 +68,11 @@ def cmu_surrounded_tasks(
     splits: Splits,
     source: str | Path = "datasets/cmu",  # data set made by `wearcap prepare cmu`
     camera: bool = True,  # film the wearer's view (videos/NAME.mp4)
-    look_round: bool = True,  # the wearer has turned round on the spot before a recording begins, so that points are available
+    # the wearer has turned round on the spot before a recording begins, so that points are available
+    look_round: bool = True,
     seed: int = 0,
-    recordings: Mapping[str, int]
-    | None = None,  # so many of each split, evenly chosen, such as {val: 8, test: 24}; null: all
+    # so many of each split, evenly chosen, such as {val: 8, test: 24}; null: all
+    recordings: Mapping[str, int] | None = None,
 ) -> list[Task]:
     """One task per recording of the data set `source`, which `wearcap prepare cmu` made (floors at z = 0), or for
     `recordings[split]` of each split, evenly chosen.

@@ -32,6 +32,7 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 
+NONE: dict[str, str] = {}
 VERSION = 1
 """Version of the conversion, increased when the same source and settings yield another recording."""
 MOTION_TYPES = ("hinge", "along_floor", "free", "absent")
@@ -226,19 +227,15 @@ def _egohoi(
     return replace(recording, motion=motion, environment=file.as_posix(), license=license)
 
 
-NONE: dict[str, str] = {}
-
-
 def egohoi_tasks(
     source: str | Path,  # the folder that holds smpl_motions and the others
     output: str | Path,
     splits: Splits,
-    motion_types: dict[
-        str, str
-    ] = NONE,  # by pattern of object names, the first that matches: hinge, along_floor, free or absent (+motion_types.OBJECT=free); otherwise objects with a hinge turn and all others slide
-    object_names: dict[
-        str, str
-    ] = NONE,  # by sequence, for single-object sequences that are not named after their model
+    # by pattern of object names, the first that matches: hinge, along_floor, free or absent
+    # (+motion_types.OBJECT=free); otherwise objects with a hinge turn and all others slide
+    motion_types: dict[str, str] = NONE,
+    # by sequence, for single-object sequences that are not named after their model
+    object_names: dict[str, str] = NONE,
     fps: float | int = 30,  # bodies (HPS's estimates) are brought to this rate; objects keep their annotations
     license: str = "EgoHOI licence (virtualhumans.mpi-inf.mpg.de/ireplica); not to be passed on",
 ) -> list[Task]:

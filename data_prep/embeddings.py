@@ -18,10 +18,11 @@ from wearcap.recording.store import Entry, RecordingFile, RecordingStore, save_r
 
 def embeddings_rework(
     dataset: str | Path,  # a folder that `wearcap prepare` made; its recordings are rewritten one by one
-    encoder: str = "egoview",  # egoview, clip (the paper's, by open_clip) or dinov2 (by timm): pip install "wearcap[images]"
+    # egoview, clip (the paper's, by open_clip) or dinov2 (by timm): pip install "wearcap[images]"
+    encoder: str = "egoview",
     checkpoint: str = "egoview",  # of egoview: a checkpoint's name or file
-    weights: str
-    | None = None,  # of clip and dinov2: a file; null: $WEARCAP_CLIP_WEIGHTS, $WEARCAP_DINOV2_WEIGHTS or the user's caches
+    # of clip and dinov2: a file; null: $WEARCAP_CLIP_WEIGHTS, $WEARCAP_DINOV2_WEIGHTS or the user's caches
+    weights: str | None = None,
     cache: str | Path | None = None,  # where embeddings are kept by content of the pictures; null: dataset/cache
     overwrite: bool = False,
 ) -> Report:

@@ -30,6 +30,7 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 from wearcap.scene.objects import CONTACT_CLASSES
 
+CLASSES = {"*door*": "hinged", "*window*": "hinged", "*": "sliding"}
 VERSION = 1
 """Version of the conversion, increased when the same source and settings yield another recording."""
 _BODY = 63
@@ -162,9 +163,6 @@ def _hcontact(root: Path, name: str, contact_class: str, fps: float | int, licen
     if not read.motion.t_world_root.any():
         motion = replace(motion, provenance=motion.provenance | {NOTE: "the body's place is not known"})
     return replace(read, motion=motion, license=license)
-
-
-CLASSES = {"*door*": "hinged", "*window*": "hinged", "*": "sliding"}
 
 
 def hcontact_tasks(

@@ -24,16 +24,18 @@ def headset_tasks(
     splits: Splits,
     subject: str = "wearer",
     license: str = "the recording's own",
-    height: float
-    | int
-    | None = None,  # of the wearer (m); null: from how high the head is carried, when it is captured
+    # of the wearer (m); null: from how high the head is carried, when it is captured
+    height: float | int | None = None,
     unit: str | float | int = AUTO,  # of length: m, cm, mm, or metres per unit
-    axes: str = AUTO,  # unity (left-handed, y up), openxr (right-handed, y up, -z forward), steamvr (as openxr), unreal (left-handed, z up)
+    # unity (left-handed, y up), openxr (right-handed, y up, -z forward), steamvr (as openxr), unreal (left-handed, z
+    # up)
+    axes: str = AUTO,
     quaternion: str = AUTO,  # order where columns do not name it: xyzw, wxyz
-    hands: str = AUTO,  # wrist: OpenXR's hand joint; a controller: grip (OpenXR's pose), pointer (forward along the arm)
+    # wrist: OpenXR's hand joint; a controller: grip (OpenXR's pose), pointer (forward along the arm)
+    hands: str = AUTO,
     time_unit: str | None = None,  # s, ms, us, ns; null: from the numbers
-    T_head_device: Sequence[float | int]
-    | None = None,  # headset on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: [0.09,0,0.075]
+    # headset on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: [0.09,0,0.075]
+    T_head_device: Sequence[float | int] | None = None,
 ) -> list[Task]:
     """One task per log: a file, or each in a folder. Raises WearcapError where there is none."""
     source = Path(source)

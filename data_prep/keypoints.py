@@ -24,6 +24,7 @@ from wearsim.sensors.keypoints import action_camera, camera_path, seen_joints
 
 VERSION = 2
 """Version of the conversion, increased when the same recording and settings yield another one."""
+FLOW = FlowSettings()
 CAMERA_FPS = 30.0
 """Rate (Hz) of the simulated camera of a recording without one."""
 
@@ -103,21 +104,19 @@ Source = Found | Recorded | Simulated
 `settings(name)` is the content that the cues of the recording of this name depend on (for `engine.content_hash`)."""
 
 
-FLOW = FlowSettings()
-
-
 def keypoints_rework(
     dataset: str | Path,  # a folder made by `wearcap prepare`; the new data set refers to its videos and scenes
     output: str | Path,
     detector: str = "mediapipe",  # pip install "wearcap[hands]"; recorded: files; simulated: of the true motion
     model: str | None = None,  # for mediapipe: hand_landmarker.task; null: $WEARCAP_HANDS_MODEL
-    file: str
-    | None = None,  # for recorded: a folder with NAME.csv (timestamp, joint, x, y[, z], confidence), or one .csv
+    # for recorded: a folder with NAME.csv (timestamp, joint, x, y[, z], confidence), or one .csv
+    file: str | None = None,
     joints: Sequence[str] = ("left_wrist", "right_wrist"),  # for simulated
     noise_px: float | int = 4.0,
     drop: float | int = 0.1,  # share of simulated keypoints that are missed
     seed: int = 0,
-    flow: FlowSettings = FLOW,  # optical flow where detections are missing: flow.reach (frames; 0: none), flow.window_px
+    # optical flow where detections are missing: flow.reach (frames; 0: none), flow.window_px
+    flow: FlowSettings = FLOW,
     jobs: int = 1,
     backend: str = "loky",
     scheduler: str | None = None,

@@ -221,11 +221,8 @@ class MocapEverySettings:
     """Settings of the conversion of a capture folder to a recording in metres, z up."""
 
     scale: float | int | None
-    """Metres per unit of SLAM, with the first camera pose taken as level; None: from the calibration board."""
     height_m: float | int
-    """Height (m) of the first camera pose above the floor, used with `scale`."""
     max_acceleration: float | int
-    """Acceleration (m/s²) beyond which camera poses are outliers."""
     max_burst_s: float | int
 
     def alignment(self, read: MocapEveryFolder, folder: Path) -> tuple[float, Rigid]:
@@ -261,9 +258,8 @@ def mocap_every_folder_tasks(
     splits: Splits,
     subject: str = "wearer",
     license: str = "the recording's own",
-    scale: float
-    | int
-    | None = None,  # metres per unit of SLAM, the first camera pose taken as level; null: from the board
+    # metres per unit of SLAM, the first camera pose taken as level; null: from the board
+    scale: float | int | None = None,
     height_m: float | int = 1.6,  # height of the first camera pose above the floor, if scale is given
     max_acceleration: float | int = 40.0,  # camera poses that accelerate more (m/s²) are outliers, and interpolated
     max_burst_s: float | int = 1.0,  # a longer stretch that deviates is no burst of outliers

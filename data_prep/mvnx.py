@@ -28,18 +28,12 @@ class SuitSettings:
 
     video: str | None = None
     camera: str | None = None
-    """Intrinsics (camera.json) of the video, or of the pictures that were localised."""
     video_start_s: float | int = 0.0
-    """Time of the video's first frame on the suit's clock; claps correct it when the recording is captured."""
     T_head_cam: Sequence[float | int] | None = None
-    """The camera on the head joint; None: upright on the forehead."""
     camera_poses: str | None = None
-    """Poses of the camera in the scene, of any format of trajectories, in metres and on the video's clock."""
     time_unit: str | None = None
     fps: float | int | None = None
-    """Rate of the localised pictures, for files with frame numbers or no times."""
     scene: str | None = None
-    """Scan of the scene, or its folder."""
 
     def files(self) -> list[Path]:
         """The other files that a recording is made of; a video counts by its size."""
@@ -95,10 +89,10 @@ def mvnx_tasks(
     video: str | None = None,  # the head camera's video, and its intrinsics (wearcap calibrate source=VIDEO)
     camera: str | None = None,  # camera.json
     video_start_s: float | int = 0.0,  # of its first frame on the suit's clock; claps correct it in the capture
-    T_head_cam: Sequence[float | int]
-    | None = None,  # camera on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: upright on the forehead
-    camera_poses: str
-    | None = None,  # the camera's poses in the scene (TUM, EuRoC, COLMAP, hloc, DROID-SLAM …), in metres
+    # camera on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: upright on the forehead
+    T_head_cam: Sequence[float | int] | None = None,
+    # the camera's poses in the scene (TUM, EuRoC, COLMAP, hloc, DROID-SLAM …), in metres
+    camera_poses: str | None = None,
     time_unit: str | None = None,  # of these: s, ms, us, ns; null: from the numbers
     fps: float | int | None = None,  # of the video, for poses with frame numbers or no times
     scene: str | None = None,  # the scene's scan, or its folder

@@ -17,7 +17,9 @@ def nymeria_tasks(
     splits: Splits,
     fps: float | int = 60.0,
     license: str = "Nymeria dataset licence; not to be passed on",
-    camera: bool = False,  # video of the head camera, 256x256 pixels, for sequences with recording_head/data/data.vrs: output/videos (needs wearcap[aria])
+    # video of the head camera, 256x256 pixels, for sequences with recording_head/data/data.vrs: output/videos (needs
+    # wearcap[aria])
+    camera: bool = False,
     output: str = ".",
 ) -> list[Task]:
     """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion, head path and points.

@@ -33,6 +33,8 @@ from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.prepare.mocap import MocapSettings, foot_patches, on_xsens23
 from wearcap.scene.objects import centered, check_object_mesh
 
+OMOMO = MocapSettings(fps=30)
+"""Faster files are brought to this rate, body and object alike."""
 FILES = ("train_diffusion_manip_seq_joints24.p", "test_diffusion_manip_seq_joints24.p")
 MESHES, MESH_ENDING = "captured_objects", "_cleaned_simplified.obj"
 _TWO_PARTS = ("mop", "vacuum")
@@ -194,17 +196,13 @@ WALKED_M = 1.0
 """Least walked distance (m) of sequences from which too low a rate can be concluded."""
 
 
-OMOMO = MocapSettings(fps=30)
-"""Faster files are brought to this rate, body and object alike."""
-
-
 def omomo_tasks(
     source: str | Path,  # the folder that holds the .p files (one of them is enough) and captured_objects
     output: str | Path,
     splits: Splits,
     settings: MocapSettings = OMOMO,
-    source_fps: float
-    | int = 30,  # not in the files; public loaders use 30 or 120; refused if people would not walk at human speeds
+    # not in the files; public loaders use 30 or 120; refused if people would not walk at human speeds
+    source_fps: float | int = 30,
     license: str = "OMOMO, research use only (lijiaman.github.io/projects/omomo); not to be passed on",
 ) -> list[Task]:
     """One task per sequence of `source`'s files; environments go to `output`/scenes.

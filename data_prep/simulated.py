@@ -14,6 +14,11 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS
 from wearsim.recordings.simulate import SimulationConfig, simulate_recording
 
+PRESETS = {
+    "quick": {"recordings": {"train": 8, "val": 2, "test": 2}, "duration_s": 30},
+    "standard": {"recordings": {"train": 120, "val": 10, "test": 20}, "duration_s": 120},
+}
+
 
 def source_files() -> str:
     """Digest of the simulator's source code."""
@@ -49,12 +54,6 @@ def split_tasks(
     return tasks
 
 
-PRESETS = {
-    "quick": {"recordings": {"train": 8, "val": 2, "test": 2}, "duration_s": 30},
-    "standard": {"recordings": {"train": 120, "val": 10, "test": 20}, "duration_s": 120},
-}
-
-
 def simulated_tasks(
     splits: Splits,
     recordings: dict[str, int],  # how many in each split
@@ -64,7 +63,8 @@ def simulated_tasks(
     activities: list[str] | None = None,  # a list of them, done in turn; null: drawn at random
     seed: int = 0,
     world: str | None = None,  # flat, outdoor, or null: drawn, three in ten outdoors
-    camera: bool = False,  # render the head camera's video (96x72 pixels, 30 Hz), with the wearer's own arms and legs: output/videos
+    # render the head camera's video (96x72 pixels, 30 Hz), with the wearer's own arms and legs: output/videos
+    camera: bool = False,
     output: str = ".",
 ) -> list[Task]:
     """`recordings[split]` recordings of `duration_s` each; people and places of the splits never meet.

@@ -22,6 +22,11 @@ from wearsim.rendering.scan import SceneSettings, write_scene
 from wearsim.rendering.views import Scenery
 from wearsim.sensors.suit import SuitNoise
 
+PRESETS = {
+    "quick": {"recordings": {"test": 1}, "spacing_m": 0.02, "photo_m": 2.6, "video_s": 30},
+    "standard": {"recordings": {"train": 2, "val": 3, "test": 5}, "spacing_m": 0.015, "photo_m": 1.8, "video_s": 60},
+}
+
 
 def _hps(
     config: HpsConfig, scene: SceneSettings | None, video: dict[str, Any], name: str, split: str, seed: int, root: Path
@@ -53,12 +58,6 @@ def _hps(
     return replace(recording, camera=replace(camera, timestamps=times, video=file.as_posix()))
 
 
-PRESETS = {
-    "quick": {"recordings": {"test": 1}, "spacing_m": 0.02, "photo_m": 2.6, "video_s": 30},
-    "standard": {"recordings": {"train": 2, "val": 3, "test": 5}, "spacing_m": 0.015, "photo_m": 1.8, "video_s": 60},
-}
-
-
 def simulated_hps_tasks(
     splits: Splits,
     output: str,
@@ -70,11 +69,8 @@ def simulated_hps_tasks(
     camera_fps: float | int = 30,
     suit: str = "typical",  # errors of the suit: ideal, typical or poor
     camera_errors: str = "typical",  # errors of the camera's localisation and its map: ideal, typical or poor
-    returns_m: Sequence[float | int] = (
-        70,
-        200,
-        380,
-    ),  # distances travelled after which the wearer is back at the capture spot
+    # distances travelled after which the wearer is back at the capture spot
+    returns_m: Sequence[float | int] = (70, 200, 380),
     end_m: float | int = 410,
     video_fps: float | int = 5,
     changed: float | int = 0.3,  # share of the movable objects that were moved or removed since the scan

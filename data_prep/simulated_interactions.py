@@ -25,6 +25,10 @@ from wearsim.rendering.scan import scan_world
 from wearsim.rendering.views import Scenery
 from wearsim.sensors.suit import SuitNoise
 
+PRESETS = {
+    "quick": {"recordings": {"train": 6, "val": 2, "test": 2}, "minutes": 2, "spacing_m": 0.03},
+    "standard": {"recordings": {"train": 48, "val": 6, "test": 10}, "minutes": 3, "spacing_m": 0.02},
+}
 MADE = "made.json"
 """File in a scene's folder that holds the settings with which it was made."""
 
@@ -63,12 +67,6 @@ def in_flat(
         write_text(note, wanted)
     scene = {} if spacing_m is None else {"scene": (place / CLOUD).as_posix()}
     return replace(recording, environment=(place / FILE_NAME).as_posix(), **scene)
-
-
-PRESETS = {
-    "quick": {"recordings": {"train": 6, "val": 2, "test": 2}, "minutes": 2, "spacing_m": 0.03},
-    "standard": {"recordings": {"train": 48, "val": 6, "test": 10}, "minutes": 3, "spacing_m": 0.02},
-}
 
 
 def simulated_interactions_tasks(

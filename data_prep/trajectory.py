@@ -23,21 +23,19 @@ def trajectory_tasks(
     splits: Splits,
     subject: str = "wearer",
     license: str = "the recording's own",
-    height: float
-    | int
-    | None = None,  # of the wearer (m); null: from how high the head is carried, when it is captured
+    # of the wearer (m); null: from how high the head is carried, when it is captured
+    height: float | int | None = None,
     up: str = AUTO,  # the world's up axis: z, y, -y, x, -x, -z
     axes: str = AUTO,  # of the device: camera (x right, y down), head (x forward, z up), openxr (x right, y up)
     time_unit: str | None = None,  # s, ms, us, ns; null: from the numbers
     fps: float | int | None = None,  # of the video, for files with frame numbers or no times
-    unit: str
-    | float
-    | int = AUTO,  # of length: m, cm, mm …, or metres per unit; auto: 1, or from points, head_imu or walks
-    T_head_device: Sequence[float | int]
-    | None = None,  # device on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: glasses, [0.09,0,0.075]
+    # of length: m, cm, mm …, or metres per unit; auto: 1, or from points, head_imu or walks
+    unit: str | float | int = AUTO,
+    # device on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: glasses, [0.09,0,0.075]
+    T_head_device: Sequence[float | int] | None = None,
     points: str | None = None,  # .ply, .pcd or a table x, y, z in the trajectory's world
-    standing: Sequence[float | int]
-    | None = None,  # [from,to] (s from the first pose) upright; with points and camera_height_m the floor gives scale and vertical
+    # [from,to] (s from the first pose) upright; with points and camera_height_m the floor gives scale and vertical
+    standing: Sequence[float | int] | None = None,
     camera_height_m: float | int | None = None,  # height of the camera above the floor while standing
     head_imu: str | None = None,  # log of an inertial sensor on the camera, on its clock: scale and vertical
     T_cam_imu: Sequence[float | int] | None = None,  # its pose in the camera, as T_head_device; null: the same axes
@@ -53,23 +51,9 @@ def trajectory_tasks(
     Raises WearcapError where there is none, and for points, a video or an inertial log of several trajectories.
     """
     source = Path(source)
-    settings = TrajectorySettings(
-        *(
-            up,
-            axes,
-            time_unit,
-            fps,
-            unit,
-            T_head_device,
-            height,
-            points,
-            standing,
-            camera_height_m,
-            head_imu,
-            T_cam_imu,
-        ),
-        *(walks, video, camera, video_start_s, max_acceleration, max_burst_s),
-    )
+    evidence = points, standing, camera_height_m, head_imu, T_cam_imu, walks
+    path, clean = (up, axes, time_unit, fps, unit, T_head_device, height), (max_acceleration, max_burst_s)
+    settings = TrajectorySettings(*path, *evidence, video, camera, video_start_s, *clean)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
     if source.is_dir() and not is_mps_folder(source) and trajectory_file(source) is None:

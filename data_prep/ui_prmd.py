@@ -70,7 +70,8 @@ def ui_prmd_tasks(
     splits: Splits,
     settings: MocapSettings = MOCAP,
     license: str = LICENSE,
-    files: str = "m??_s??_e??*",  # their names: movement, person, repetition; those of badly done ones (_inc) are motion, too
+    # their names: movement, person, repetition; those of badly done ones (_inc) are motion, too
+    files: str = "m??_s??_e??*",
 ) -> list[Task]:
     """One task per trial, a body per person."""
     rules, how = (r"_(s\d\d)_", r"(m\d\d)_"), Conventions()

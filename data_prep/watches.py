@@ -81,9 +81,8 @@ def watches_tasks(
     calibration: str | None = None,  # calibration.json; null: clocks, headings and mounts are taken as they are
     subject: str = "wearer",
     license: str = "the recording's own",
-    height: float
-    | int
-    | None = None,  # of the wearer (m); null: from how high the head is carried, when it is captured
+    # of the wearer (m); null: from how high the head is carried, when it is captured
+    height: float | int | None = None,
     up: str = AUTO,  # as in prepare trajectory, where the calibration does not cover the camera; also axes, time_unit …
     axes: str = AUTO,
     time_unit: str | None = None,

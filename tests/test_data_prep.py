@@ -30,8 +30,8 @@ def test_the_page_tells_what_a_source_needs(source):
 
 def test_every_list_has_a_source_and_every_setting_a_default_or_a_text():
     assert {path.stem for path in (DATA_PREP / "splits").glob("*.csv")} <= sources().keys()
-    for source, path in sources().items():
+    for source in sources():
         config = compose("prepare", [f"prepare={source}"])
         missing = {str(key) for key in config if OmegaConf.is_missing(config, key)}
         shown = {row.strip().split("=")[0] for row in help_of("prepare", [source]).splitlines() if "=" in row}
-        assert missing - {"right"} <= shown, path
+        assert missing - {"right"} <= shown, source

@@ -9,7 +9,7 @@ from wearcap.recording.timing import resampled
 from wearcap.sensors.initialization import align_suit, body_camera, inliers
 from wearcap.systems.hps.camera import Localize, MapLocalization, Synchronization
 from wearcap.systems.hps.pipeline import required
-from wearcap.systems.hps.placed_suit import PlacedSuit
+from wearcap.systems.ireplica.bent_suit import PlacedSuit
 
 KINDS = ("imu", "imu_cam", "imu_cam_filtered")
 

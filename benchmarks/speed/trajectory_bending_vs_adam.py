@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 
-from benchmarks.speed.figures import figure
 from benchmarks.rivals import compose
+from benchmarks.speed.figures import figure
 from wearcap.systems.ireplica.trajectory import BendingProblem, BentPath, bend_adam, bending_problem
 from wearcap.systems.ireplica.trajectory_banded import bend_banded
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 
-from wearcap.cli.verbs import GIVEN, entry_of, sources
+from wearcap.cli.verbs import GIVEN, sources
 
 
 def register(overrides: Iterable[str], splits: Path) -> None:
@@ -28,24 +28,25 @@ def config_of(source: str, splits: Path) -> dict[str, Any]:
     Settings named in the module's PRESETS have the values of the preset that is chosen. The split list is the
     source's own, or that of what its name begins with: those of simulated_hps are of simulated people.
     """
-    module = importlib.import_module(f"data_prep.{source}")
-    entry = entry_of(sources()[source])
+    file, entry, _, defaults = sources()[source]
+    module = importlib.import_module(f"data_prep.{file.stem}")
     presets: dict[str, dict[str, Any]] = getattr(module, "PRESETS", {})
     lists = [path.stem for path in splits.glob("*.csv") if source.startswith(path.stem)]
     config: dict[str, Any] = {"name": source, **({"splits": f"{max(lists, key=len)}.csv"} if lists else {})}
     config |= {"presets": presets, "preset": "standard"} if presets else {}
-    call = {"_target_": f"data_prep.{source}.{entry.name}"}
+    call = {"_target_": f"data_prep.{file.stem}.{entry.name}"}
     for setting, parameter in inspect.signature(getattr(module, entry.name)).parameters.items():
-        if setting == "splits":
-            continue
-        call[setting] = f"${{{setting}}}"
+        default = defaults.get(setting, parameter.default)
+        if setting != "splits":
+            call[setting] = f"${{{setting}}}"
         if setting in next(iter(presets.values()), {}):
             config[setting] = f"${{presets.${{preset}}.{setting}}}"
-        elif setting not in GIVEN:
-            config[setting] = "???" if parameter.default is parameter.empty else _plain(parameter.default)
-    if "output" not in call and entry.name.endswith("_rework"):
+        elif setting not in ("splits", *GIVEN):
+            config[setting] = "???" if default is parameter.empty else _plain(default)
+    kind = entry.name.removeprefix(f"{file.stem}_")
+    if kind == "rework" and "output" not in call:
         config["output"] = "${dataset}"
-    return config | {entry.name.removeprefix(f"{source}_"): call}
+    return config | {kind: call}
 
 
 def _plain(value: Any) -> Any:

@@ -2,12 +2,14 @@
 
 import argparse
 import ast
+import functools
 import importlib.util
+import itertools
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
@@ -54,20 +56,32 @@ GIVEN = ("output", "jobs", "backend", "scheduler", "overwrite")
 """Settings of a source that all have, from `conf/prepare.yaml`."""
 
 
-def sources() -> dict[str, Path]:
-    """Sources of `prepare` by name: the files of `data_prep/` with a function NAME_tasks or NAME_rework."""
-    found = importlib.util.find_spec("data_prep")
-    folders = [Path(folder) for folder in (found and found.submodule_search_locations) or ()]
-    files = sorted(path for folder in folders for path in folder.glob("*.py"))
-    entry = re.compile(r"^def (\w+)_(?:tasks|rework)\(", re.MULTILINE)
-    return {path.stem: path for path in files if path.stem in entry.findall(path.read_text(encoding="utf-8"))}
+class Source(NamedTuple):
+    """A source of `prepare`: the function of a file in `data_prep/` whose arguments are its settings."""
+
+    file: Path
+    entry: ast.FunctionDef
+    about: str
+    defaults: dict[str, Any]
+    """Settings whose defaults are not the function's own."""
 
 
-def entry_of(path: Path) -> ast.FunctionDef:
-    """The function of a source's file whose arguments are its settings: NAME_tasks or NAME_rework."""
-    names = f"{path.stem}_tasks", f"{path.stem}_rework"
-    body = ast.parse(path.read_text(encoding="utf-8")).body
-    return next(node for node in body if isinstance(node, ast.FunctionDef) and node.name in names)
+@functools.cache
+def sources() -> dict[str, Source]:
+    """Sources by name: files NAME.py of `data_prep/` with a function NAME_tasks or NAME_rework, and their VARIANTS."""
+    found, package = dict[str, Source](), importlib.util.find_spec("data_prep")
+    for folder in (package and package.submodule_search_locations) or ():
+        for file in Path(folder).glob("*.py"):
+            tree, name = ast.parse(file.read_text(encoding="utf-8")), file.stem
+            entries = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+            assigned = (node for node in tree.body if isinstance(node, ast.Assign))
+            variants = next(
+                (ast.literal_eval(node.value) for node in assigned if ast.unparse(node.targets[0]) == "VARIANTS"), {}
+            )
+            for entry in (each for each in entries if each.name in (f"{name}_tasks", f"{name}_rework")):
+                found[name] = Source(file, entry, (ast.get_docstring(tree) or "").split("\n\n")[0], {})
+                found |= {key: Source(file, entry, values.pop("about"), values) for key, values in variants.items()}
+    return dict(sorted(found.items()))
 
 
 def overrides(verb: str, arguments: Sequence[str]) -> list[str]:
@@ -163,33 +177,28 @@ def help_of(verb: str, arguments: Sequence[str]) -> str | None:
 
 def _help_of_prepare(words: Sequence[str]) -> str:
     if words and words[0] in sources():
-        path = sources()[words[0]]
-        rows = _signature(path) + _help_rows(conf_dir() / "prepare.yaml")[0]
-        return page([_summary(path)], f"wearcap prepare {words[0]}", rows, [f"Settings within others: see {path}."])
-    rows = [
-        (name, textwrap.shorten(_summary(path), COLUMNS - 24, placeholder=" …")) for name, path in sources().items()
-    ]
+        source = sources()[words[0]]
+        rows, more = _signature(source) + _help_rows(conf_dir() / "prepare.yaml")[0], f"Others: see {source.file}."
+        return page([source.about], f"wearcap prepare {words[0]}", rows, [more])
+    rows = [(name, textwrap.shorten(each.about, COLUMNS - 24, placeholder=" …")) for name, each in sources().items()]
     return page([VERBS["prepare"]], "wearcap prepare SOURCE", rows, ["wearcap prepare SOURCE --help: its settings."])
 
 
-def _summary(path: Path) -> str:
-    """The first paragraph of a module's docstring."""
-    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").split("\n\n")[0]
-
-
-def _signature(path: Path) -> list[tuple[str, str]]:
-    """(key=value, its comment) of a source's settings, as the comments of its function's arguments explain them."""
-    lines, entry = path.read_text(encoding="utf-8").splitlines(), entry_of(path)
-    arguments, rows = [*entry.args.args, *entry.args.kwonlyargs], []
-    defaults = [None] * (len(entry.args.args) - len(entry.args.defaults)) + entry.args.defaults + entry.args.kw_defaults
-    for argument, default in zip(arguments, defaults):
-        comment = lines[argument.lineno - 1].partition("  # ")[2]
-        if comment:
-            value = ast.literal_eval(default) if isinstance(default, ast.Constant | ast.Tuple | ast.List) else None
-            text = str(list(value) if isinstance(value, tuple) else value).replace(" ", "")
-            shown = "…" if value is None else text.lower() if isinstance(value, bool) else text
-            rows.append((f"{argument.arg}={shown}", comment))
-    return rows
+def _signature(source: Source) -> list[tuple[str, str]]:
+    """(key=value, text) of a source's settings that have a comment, behind an argument or above it."""
+    lines, rows = source.file.read_text(encoding="utf-8").splitlines(), []
+    arguments = source.entry.args
+    for argument, default in zip(arguments.args[::-1], [*arguments.defaults[::-1], *[None] * len(arguments.args)]):
+        place = argument.lineno - 1
+        above = list(itertools.takewhile(lambda line: line.lstrip().startswith("# "), lines[place - 1 :: -1]))
+        text = lines[place].partition("  # ")[2] or " ".join(line.strip("# ") for line in above[::-1])
+        value = source.defaults.get(argument.arg)
+        if value is None and isinstance(default, ast.Constant | ast.Tuple):
+            value = ast.literal_eval(default)
+        shown = str(list(value)).replace(" ", "") if isinstance(value, tuple) else str(value)
+        shown = "…" if value is None or " " in shown else shown.lower() if isinstance(value, bool) else shown
+        rows += [(f"{argument.arg}={shown}", text)] if text else []
+    return rows[::-1]
 
 
 def _about(text: str) -> list[str]:

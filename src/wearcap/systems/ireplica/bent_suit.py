@@ -1,7 +1,9 @@
 """The thesis's registration of iReplica (§5.3.1): the suit's path is bent to the camera positions."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 
@@ -9,11 +11,54 @@ from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import interpolate
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
+from wearcap.runtime.stages import Stage, StagedSystem
+from wearcap.runtime.system import CaptureInput
 from wearcap.sensors.initialization import align_suit, body_camera, inliers
-from wearcap.systems.hps.camera import Localize, MapLocalization, Synchronization
-from wearcap.systems.hps.pipeline import required
-from wearcap.systems.hps.placed_suit import PlacedSuit
+from wearcap.systems.hps.camera import (
+    Localize,
+    MapLocalization,
+    Synchronization,
+    camera_report,
+    camera_stages,
+    on_one_clock,
+)
+from wearcap.systems.hps.pipeline import mount, require, required
 from wearcap.systems.ireplica.trajectory import BentPath
+
+
+class PlacedSuit(StagedSystem):
+    """A pipeline that places the suit's motion in the scene in one step after the first two of HPS."""
+
+    fps: float
+    synchronization: Synchronization
+    localization: Localize
+
+    @abstractmethod
+    def place(self, recording: Recording) -> Motion:
+        """The suit's motion in the scene."""
+
+    def stages(self, source: CaptureInput) -> list[Stage]:
+        """The first two stages of HPS, then `place`. Raises WearcapError as HPS does."""
+        recording = source.recording
+        require(recording, "suit", "camera")
+        own = {key: value for key, value in vars(self).items() if key not in ("synchronization", "localization")}
+        return [
+            *camera_stages(source, self.synchronization, self.localization),
+            Stage(
+                "place",
+                lambda done: self.place(on_one_clock(recording, done)),
+                lambda: (own, recording.suit, *mount(recording)),
+                ("synchronize", "localize"),
+            ),
+        ]
+
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion, once it has been placed."""
+        return results.get("place")
+
+    def report(self, source: CaptureInput, results: dict[str, Any]) -> dict[str, Any]:
+        """Clock and share of localised frames."""
+        return camera_report(results)
 
 
 @dataclass(frozen=True)
