@@ -1,6 +1,6 @@
 """Every source of `wearcap live` is given damaged packets: it must understand or count them, quickly, and keep nothing.
 
-    python -m benchmarks.faults.live_fuzz [SOURCE ...] [--packets 1000000] [--seed 0]
+    python tests/fuzz_packets.py [SOURCE ...] [--packets 1000000] [--seed 0]
 
 Prints one JSON line per source: packets given, samples delivered, what was refused, the processor time of a packet
 (median, 99th percentile, longest), growth of the process's memory over the last nine tenths, and growth of Python's own
@@ -31,18 +31,15 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from benchmarks.faults.fuzz_mutate import FLOATS, NUMBER, VALUES, WHOLE, mutated
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[2] / "tests")]
-
-from sound_packets import SOUND  # noqa: E402
-from wearcap.apps.live.packets import Inbox, Packet  # noqa: E402
-from wearcap.apps.live.source import Budget, DatagramSource  # noqa: E402
-from wearcap.apps.live.sources import SOURCES, source_of  # noqa: E402
-from wearcap.apps.live.sources.parts import MAX_NAME  # noqa: E402
-from wearcap.apps.live.sources.posts import MAX_HEADER, _Connections  # noqa: E402
-from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, pose_fault, time_fault, values_fault  # noqa: E402
-from wearcap.sensors.samples import (  # noqa: E402
+from fuzz_mutate import FLOATS, NUMBER, VALUES, WHOLE, mutated
+from sound_packets import SOUND
+from wearcap.apps.live.packets import Inbox, Packet
+from wearcap.apps.live.source import Budget, DatagramSource
+from wearcap.apps.live.sources import SOURCES, source_of
+from wearcap.apps.live.sources.parts import MAX_NAME
+from wearcap.apps.live.sources.posts import MAX_HEADER, _Connections
+from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, pose_fault, time_fault, values_fault
+from wearcap.sensors.samples import (
     ActiveObject,
     HeadSample,
     LocalizationSample,

@@ -1,6 +1,6 @@
 """Every reader of files and messages is given damaged ones: it must read them or say in a WearcapError what is wrong.
 
-    python -m benchmarks.faults.fuzz_readers [READER ...] [--inputs 100000] [--seed 0] [--seconds S] [--jobs 2]
+    python tests/fuzz_readers.py [READER ...] [--inputs 100000] [--seed 0] [--seconds S] [--jobs 2]
 
 Prints one JSON line per reader and a total: how many inputs were read, how many refused with a WearcapError, other
 exceptions by type and place, inputs that took longer than 5 seconds of the processor, that took more memory than 10
@@ -35,13 +35,10 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from benchmarks.faults.fuzz_mutate import mutated
+import valid_files
+import valid_own_files
+from fuzz_mutate import mutated
 from wearcap.errors import WearcapError
-
-sys.path[:0] = [str(Path(__file__).resolve().parents[2] / "tests")]
-
-import valid_files  # noqa: E402
-import valid_own_files  # noqa: E402
 
 READERS = valid_files.READERS | valid_own_files.OWN
 ALARM_S, DEAF_S, MEMORY_BYTES = 5.0, 30.0, 3 << 29
