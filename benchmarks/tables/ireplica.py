@@ -17,21 +17,8 @@ from joblib import Parallel, delayed
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.tables import result_pages as pages
 from benchmarks.tables.ireplica_runs import Networks, RecordingRun, run_recording
-from benchmarks.tables.result_pages import (
-    NONE,
-    Grid,
-    Page,
-    Tree,
-    Trees,
-    commands,
-    figures_of,
-    grid_of,
-    machines,
-    mean,
-    text,
-    times,
-)
 from benchmarks.tables.tabling import cell, new_table, summarize, write_tree
 from wearcap.errors import WearcapError
 from wearcap.metrics.detection import mean_detection_scores
@@ -149,18 +136,18 @@ CLOCKS = {
 """Benchmarks: what is measured, what is given, and what it is held against."""
 
 
-def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
+def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
     """What docs/results/ireplica.md says."""
     tree = trees["ireplica"]
     rows, about = tree["rows"], tree["about"]
     groups = rows["ours"]["all"]["end_cm"]["seeds"]
     spread = f"{groups} groups of {len(about['recordings'])} recordings"
-    theirs, both = (mean(rows[name]["all"]["end_cm"]) for name in ("as published", "as published, our contacts"))
-    factor = figures_of(speed, "ireplica_realtime_factor")
+    theirs, both = (pages.mean(rows[name]["all"]["end_cm"]) for name in ("as published", "as published, our contacts"))
+    factor = pages.figures_of(speed, "ireplica_realtime_factor")
     beside = {name: trees[f"ireplica_{name}"] for name in PRESETS if f"ireplica_{name}" in trees}
-    return Page(
+    return pages.Page(
         title="[iReplica](../ireplica.md): figures",
-        headline=Grid(
+        headline=pages.Grid(
             "Where objects were left, and hands and objects against their own true places during contact: "
             f"{tree['handlings']} handlings, means over {spread}, ± the deviation over groups; AP of the contacts "
             "that drive the row.",
@@ -182,12 +169,16 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "[simulation](simulation.md). Camera and suit share one clock, but in rows that say so. Contacts of a detector are those of a "
         "simulated one, which errs as often as Hand Object Detector does by its own record: no picture was looked at. Every row captures the same motion.",
         limits=_limits(tree),
-        full=[grid_of(table, about, spread) for table in _shown(tree)]
-        + [grid_of(each, other["about"], spread) for name, other in beside.items() for each in _beside(name, other)],
-        commands=commands(trees),
-        measured=f"objects end {mean(rows['ours']['all']['end_cm'])} cm off{_from_ideal_to_poor(beside)}, in environments measured by hand (the "
+        full=[pages.grid_of(table, about, spread) for table in _shown(tree)]
+        + [
+            pages.grid_of(each, other["about"], spread)
+            for name, other in beside.items()
+            for each in _beside(name, other)
+        ],
+        commands=pages.commands(trees),
+        measured=f"objects end {pages.mean(rows['ours']['all']['end_cm'])} cm off{_from_ideal_to_poor(beside)}, in environments measured by hand (the "
         f"paper's tracker with our contacts {both}; as published {theirs})",
-        speed=f"{times(factor)} real time, localised cameras given ({machines(factor)})" if factor else "",
+        speed=f"{pages.times(factor)} real time, localised cameras given ({pages.machines(factor)})" if factor else "",
         clocks=CLOCKS,
         pictures=tuple(
             (f"ireplica_{name}.png", f"{what}: truth above and captured below, hands in contact green")
@@ -200,13 +191,13 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     )
 
 
-def _from_ideal_to_poor(beside: Trees) -> str:
+def _from_ideal_to_poor(beside: pages.Trees) -> str:
     """Where objects end by what sensors measured."""
-    ends = [mean(beside[name]["rows"]["ours"]["all"]["end_cm"]) for name in ("ideal", "poor") if name in beside]
+    ends = [pages.mean(beside[name]["rows"]["ours"]["all"]["end_cm"]) for name in ("ideal", "poor") if name in beside]
     return f" ({' to '.join(ends)} by sensors from ideal to poor)" if len(ends) == 2 else ""
 
 
-def _beside(name: str, tree: Tree) -> list[Table]:
+def _beside(name: str, tree: pages.Tree) -> list[Table]:
     """The tables of a data set with one preset's sensors; the rows of typical ones are the page's other tables."""
     shown = [] if name == "typical" else [_ends(tree), _hands(tree)]
     for table in shown:
@@ -214,31 +205,31 @@ def _beside(name: str, tree: Tree) -> list[Table]:
     return shown
 
 
-def _headline_rows(tree: Tree, beside: Trees) -> list[list[str]]:
+def _headline_rows(tree: pages.Tree, beside: pages.Trees) -> list[list[str]]:
     """Rows of the page's first table: of typical sensors, ours with others, and the paper's."""
     rows = [[label, *_headline(tree, row)] for row, label in HEADLINE.items() if row in tree["rows"]]
     others = {name: other for name, other in beside.items() if name != "typical"}
     rows += [[f"**ours**, {name} sensors", *_headline(other, "ours")] for name, other in others.items()]
     paper = [f"{value:.1f}" for value in (*PAPER_END["as published"], PAPER_HAND["as published"])]
     known = PAPER_DETECTION["the paper's, on H-contact"][0]
-    return [*rows, ["the paper's, on its own recordings", *paper, NONE, NONE, f"{known:.3f}"]]
+    return [*rows, ["the paper's, on its own recordings", *paper, pages.NONE, pages.NONE, f"{known:.3f}"]]
 
 
-def _headline(tree: Tree, row: str) -> list[str]:
+def _headline(tree: pages.Tree, row: str) -> list[str]:
     found, detector = tree["rows"][row]["all"], tree["detection"].get(CONTACTS.get(row))
     precision = detector["detection"]["average_precision"] if detector else None
     names = ("end_cm", "end_deg", "hand_object_cm", "hand_cm", "object_cm")
-    return [*(text(found[name], 1) for name in names), text(precision, 3)]
+    return [*(pages.text(found[name], 1) for name in names), pages.text(precision, 3)]
 
 
-def _limits(tree: Tree) -> tuple[str, ...]:
+def _limits(tree: pages.Tree) -> tuple[str, ...]:
     """The weak sides, with their figures."""
     rows = tree["rows"]
     kinds = rows["ours"]["kinds"]
     worst = max(KINDS, key=lambda kind: kinds[kind]["end_cm"]["mean"] or 0.0)
-    ends = {row: mean(found["all"]["end_cm"]) for row, found in rows.items()}
+    ends = {row: pages.mean(found["all"]["end_cm"]) for row, found in rows.items()}
     return (
-        f"The worst kind of object is the {worst}: its ends are {mean(kinds[worst]['end_cm'])} cm off.",
+        f"The worst kind of object is the {worst}: its ends are {pages.mean(kinds[worst]['end_cm'])} cm off.",
         f"Two steps win nothing here: ends are {ends['ours']} cm off, without the contact correction "
         f"{ends['ours, w/o contact corr.']}, without the fit about hinges {ends['ours, no fit about hinges']}.",
         f"Contacts decide: with true ones ends are {ends['ours, true contacts']} cm off, with those of the simulated detector "
