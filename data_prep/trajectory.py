@@ -43,11 +43,13 @@ def trajectory_tasks(
     video: str | None = None,  # the head camera's video, and its intrinsics (wearcap calibrate)
     camera: str | None = None,  # camera.json
     video_start_s: float | int = 0.0,  # time of its first frame after the first pose
-    max_acceleration: float | int = 40.0,  # poses that accelerate more (m/s²) are outliers, and interpolated
-    max_burst_s: float | int = 1.0,  # a longer stretch that deviates is no burst of outliers
+    max_acceleration: float | int = 40.0,
+    max_burst_s: float | int = 1.0,
 ) -> list[Task]:
     """One task per trajectory: a file, a folder that is one, or each trajectory in a folder.
 
+    Poses that accelerate more than `max_acceleration` (m/s²) are outliers, and interpolated, unless they last longer than
+    `max_burst_s`.
     Raises WearcapError where there is none, and for points, a video or an inertial log of several trajectories.
     """
     source = Path(source)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from benchmarks.rivals import compose
 from benchmarks.speed import latent_optimisation_vs_best_adam as clocks
 from benchmarks.tables import echo as tables_echo
 from benchmarks.tables import hmd2 as tables_hmd2
@@ -14,7 +15,6 @@ from benchmarks.tables import mocap_every as tables
 from benchmarks.tables import tabling
 from benchmarks.tables.hmd2_runs import Result, best_of
 from benchmarks.tables.sensed import GIVEN, WRONG_HEIGHTS, SensedStore, sensed
-from wearcap.cli.conf import compose
 
 
 def test_a_row_prints_what_its_training_took(tmp_path, trusted):

@@ -94,7 +94,7 @@ def test_derivative_of_the_energy(settings):
 
 def test_steps_take_the_turn_of_the_last_one_that_moves():
     path = torch.tensor([[0.0, 0], [0, 0], [0, 1], [0, 1], [0, 1], [-1, 1]]).double()
-    problem = bending_problem(path, torch.arange(6).double(), torch.zeros(0).double(), path[:0], None, Bending())
+    problem = bending_problem(path, torch.arange(6).double(), torch.zeros(0).double(), path[:0], None, Bending(10.0))
     assert problem.leader.tolist() == [1, 1, 1, 1, 4]
 
 
@@ -268,7 +268,7 @@ def test_bad_input_is_refused(change, message):
         "weights": torch.ones(2),
     }
     with pytest.raises(WearcapError, match=message):
-        bend(**(known | change), settings=Bending(), solver=bend_banded)
+        bend(**(known | change), settings=Bending(10.0), solver=bend_banded)
 
 
 def test_bad_settings_are_refused():
