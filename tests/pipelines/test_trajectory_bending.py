@@ -235,7 +235,7 @@ def test_degenerate_paths(solver):
     timestamps = torch.arange(5).double()
     still, walk = torch.ones(5, 2), torch.arange(10.0).reshape(5, 2)
     for free in (False, True):
-        settings = Bending(free_start=free, clamped_ends=free)
+        settings = Bending(10.0, free_start=free, clamped_ends=free)
         unheld = bend(walk, timestamps, timestamps[:0], walk[:0], settings=settings, solver=solver)
         torch.testing.assert_close(unheld.path, walk.double(), rtol=0.0, atol=1e-6)
         stands = bend(still, timestamps, timestamps[1:2], still[:1] + 3, settings=settings, solver=solver)
@@ -274,7 +274,7 @@ def test_bad_input_is_refused(change, message):
 def test_bad_settings_are_refused():
     for wrong in ({"rigidity": 0.0}, {"rigidity": math.nan}, {"norm": "cubic"}):
         with pytest.raises(WearcapError):
-            Bending(**wrong)
+            Bending(**({"rigidity": 1.0} | wrong))
 
 
 def _least(solved) -> float:
