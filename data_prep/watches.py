@@ -91,8 +91,8 @@ def watches_tasks(
     T_head_device: Sequence[float | int] | None = None,
 ) -> list[Task]:
     """The one recording of two watches and a head camera; hashed by all files."""
-    way = TrajectorySettings(up, axes, time_unit, fps, unit, T_head_device, height)
-    settings = WatchesSettings(left, right, calibration, way)
+    path = TrajectorySettings(up, axes, time_unit, fps, unit, T_head_device, height)
+    settings = WatchesSettings(left, right, calibration, path)
     others = [*settings.logs().values(), *([Path(settings.calibration)] if settings.calibration else [])]
     files = [Path(camera), *others, *settings.camera.files()]
     if missing := [str(file) for file in files if not file.exists()]:

@@ -77,8 +77,8 @@ def place_rig(world: World, spot: Float[np.ndarray, "3"], radius_m: float = 2.4,
 def registered(poses: Rigid, rng: np.random.Generator) -> Rigid:
     """Poses "camera" as far off as registration leaves them, each in a random direction."""
     shift, axis = (torch.from_numpy(rng.standard_normal(poses.t.shape)) for _ in range(2))
-    turn, way = (part / part.norm(dim=-1, keepdim=True) for part in (axis, shift))
-    return Rigid(exp(np.deg2rad(REGISTERED_DEG) * turn) @ poses.R, poses.t + REGISTERED_M * way)
+    turn, shift = (part / part.norm(dim=-1, keepdim=True) for part in (axis, shift))
+    return Rigid(exp(np.deg2rad(REGISTERED_DEG) * turn) @ poses.R, poses.t + REGISTERED_M * shift)
 
 
 def person_clouds(
