@@ -1,7 +1,6 @@
 """How high people carry their heads while upright, as a share of the head joint's height in the rest pose.
 
-    python benchmarks/carried_heads.py --datasets datasets/cmu datasets/hdm05 [--split train] [--legs 0.98]
-                                                            by person, as a table; with other legs on the same feet
+    python benchmarks/run.py carried_heads
 
 Data sets whose bones and floors are known. The shares: of frames in which people walk upright on the floor; of frames in
 which they stand; of the highest tenth of both, which heights follow from (`tracking.stature`); and of floors, by how much the
@@ -9,7 +8,6 @@ one that `tracking.floor.floor_from_path` finds is too low. value: median share 
 of which ratio is the multiple: heights and floors that follow from it are that much too large.
 """
 
-import argparse
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -93,24 +91,3 @@ def measure(folders: Sequence[str] = ("cmu", "hdm05", "simulated"), split: str |
                 found = {"name": name, "value": value, "unit": unit, "baseline": CARRIED}
                 figures.append({**found, "ratio": value / CARRIED, "goal": 1.0})
     return figures
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description="How high people carry their heads: by person, as a table.")
-    parser.add_argument("--datasets", nargs="+", type=Path, required=True, help="folders of prepared data sets")
-    parser.add_argument("--split", help="train, val or test (default: all)")
-    parser.add_argument("--legs", type=float, default=1.0, help="length of the legs, of those in the data set")
-    options = parser.parse_args()
-    print(f"| set, person | {' | '.join(KINDS)} |\n|---{'|---' * len(KINDS)}|")
-    for folder in options.datasets:
-        people = by_person(folder, options.split, options.legs)
-        each = np.array([list(share.values()) for share in people.values()])
-        middle = [np.median(column[np.isfinite(column)]) if np.isfinite(column).any() else np.nan for column in each.T]
-        rows = {f"{folder.name} {person}": list(share.values()) for person, share in people.items()}
-        for name, row in {**rows, f"**{folder.name}**, median of people": middle}.items():
-            print(f"| {name} | {' | '.join('–' if np.isnan(value) else f'{value:.3f}' for value in row)} |")
-    print(f"\nNow CARRIED is {CARRIED}: a person of share s is taken to be s / {CARRIED} times as tall.")
-
-
-if __name__ == "__main__":
-    main()

@@ -26,8 +26,12 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.rivals import SEARCH, compose
+from benchmarks.rivals.hps_suit import KINDS as SUIT_ROWS
 from wearcap.cli import capture, evaluate, export, prepare, train
-from wearcap.cli.conf import compose, load_pipeline
+from wearcap.cli.conf import load_pipeline
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.active_objects import true_spans
@@ -89,12 +93,14 @@ CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
     "hps_paper": (None, "hps", (*SHARED, "pipeline.solver.settings.steps=4")),
     "hps_released": (None, "hps", SHARED),
     "hps_without_scene": (None, "hps", SHARED),
-    "hps_imu": (None, "hps", SHARED),
-    "hps_imu_cam": (None, "hps", SHARED),
-    "hps_imu_cam_filtered": (None, "hps", SHARED),
+    **{f"hps_{kind}": (None, "hps", (*SHARED, f"pipeline.kind={kind}")) for kind in SUIT_ROWS},
     "bent_suit": (None, "hps", SHARED),
     "ireplica": ("contact_sequence", "flats", ()),
-    "ireplica_without_correction": ("contact_sequence", "flats", ()),
+    "ireplica_without_correction": (
+        "contact_sequence",
+        "flats",
+        ("pipeline.tracker.correction=null", "pipeline.tracker.hands=null"),
+    ),
     "ireplica_paper": ("[contact_transformer_sliding,contact_transformer_hinged]", "flats", ()),
     "pose_regressor": ("runs/pose_regressor_hands/checkpoints/last.ckpt", "walkers", ()),
 }
@@ -111,11 +117,9 @@ PIPELINES = {
     "hps_paper": "paper/hps",
     "hps_released": "paper/hps_released",
     "hps_without_scene": "paper/hps_without_scene",
-    "hps_imu": "baseline/hps_imu",
-    "hps_imu_cam": "baseline/hps_imu_cam",
-    "hps_imu_cam_filtered": "baseline/hps_imu_cam_filtered",
+    **{f"hps_{kind}": "baseline/hps_suit" for kind in SUIT_ROWS},
     "bent_suit": "paper/bent_suit",
-    "ireplica_without_correction": "ablation/ireplica_without_correction",
+    "ireplica_without_correction": "ireplica",
     "ireplica_paper": "paper/ireplica",
 }
 """Pipeline configs of the captures that are not named after theirs."""
@@ -196,6 +200,7 @@ def captured(name: str) -> Arrays:
     output = Path("captures", name)
     capture.main(
         [
+            SEARCH,
             f"pipeline={PIPELINES.get(name, name)}",
             f"recording={recording_of(dataset)}",
             f"output={output}",
@@ -214,6 +219,7 @@ def trained(name: str) -> Arrays:
     shutil.rmtree(output, ignore_errors=True)
     train.main(
         [
+            SEARCH,
             f"experiment={name}",
             f"hydra.run.dir={output}",
             "trainer.max_steps=3",
@@ -235,6 +241,7 @@ def evaluated(name: str) -> Arrays:
     output = Path("tables", f"{name}.json")
     evaluate.main(
         [
+            SEARCH,
             "baselines=" + str(name == "pose_regressor").lower(),
             f"output={output}",
             "hydra.run.dir=tables",

@@ -1,4 +1,7 @@
-"""AMASS: SMPL-H or SMPL-X files, laid out DATASET/SUBJECT/MOTION.npz."""
+"""AMASS as it unpacks (DATASET/SUBJECT/MOTION.npz), SMPL-H or SMPL-X; bring your own download.
+
+Random splits of its data sets were never published as lists: splits=FILE takes rows of subjects (CMU/14) and of files
+(CMU/14/14_01_poses)."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -6,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from data_prep.shared.engine import Splits, Task, source_folder
-from data_prep.shared.mocap import About, MocapSettings, mocap_recording
+from data_prep.shared.mocap import MOCAP, About, MocapSettings, mocap_recording
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO
@@ -26,12 +29,14 @@ def _amass(file: Path, about: About, settings: MocapSettings, up: str) -> Record
 
 
 def amass_tasks(
-    source: str | Path,
+    source: str | Path,  # the folder that holds the data sets' folders
     splits: Splits,
-    settings: MocapSettings,
-    license: str,
+    settings: MocapSettings = MOCAP,
+    license: str = "AMASS licence (amass.is.tue.mpg.de); not to be passed on",
+    # data sets' folders: MocapEvery's are [CMU, MPI_HDM05, BMLmovi], protocol 1's [BioMotionLab_NTroje, CMU,
+    # MPI_HDM05]; null: all
     subsets: Sequence[str] | None = None,
-    up: str = AUTO,
+    up: str = AUTO,  # the axis that is up: z as in AMASS, or where somebody clearly stands along another; x, y, z, -x …
 ) -> list[Task]:
     """One task per motion file below `source`, laid out DATASET/SUBJECT/MOTION.npz, of all data sets or of `subsets`;
     `up` is the axis that is up in all.

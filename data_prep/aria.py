@@ -1,4 +1,4 @@
-"""Project Aria's recordings after Meta's machine perception services (MPS)."""
+"""Project Aria recordings: folders of MPS output (closed_loop_trajectory.csv, semi-dense points); plain, .gz or .xz."""
 
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,13 @@ VERSION = 2
 """Version of the conversion, increased when the same source and settings yield another recording."""
 
 
-def aria_tasks(source: str | Path, splits: Splits, subject: str, fps: float | int, license: str) -> list[Task]:
+def aria_tasks(
+    source: str | Path,  # a folder of MPS output, or one that holds such folders
+    splits: Splits,
+    subject: str = "wearer",
+    fps: float | int = 60.0,
+    license: str = "the recording's own",
+) -> list[Task]:
     """One task per closed-loop trajectory at or below `source`, named after its recording's folder."""
     source = source_folder(source)
     folders: dict[Path, Path] = {}  # by trajectory, the outermost folder: REC of REC/slam and REC/mps/slam, too

@@ -1,4 +1,4 @@
-"""BEHAVE at 30 frames per second: a person and one of twenty objects, fitted to four depth cameras' pictures.
+"""BEHAVE at 30 fps (sequences/, objects/): people handling one of twenty objects; bring your own download.
 
 Folders as they unpack: `sequences/DATE_SUBJECT_OBJECT[_ACT]/` (or `behave-30fps-params-v1/…`) with `info.json`,
 `smpl_fit_all.npz` and `object_fit_all.npz`, and `objects/OBJECT/` with the meshes. The world is the frame of one of the
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from data_prep.one_object import VERSION, OneObject, one_object_recording
 from data_prep.shared.engine import Splits, Task
-from data_prep.shared.mocap import MocapSettings, foot_patches, on_xsens23
+from data_prep.shared.mocap import CleaningLimits, MocapSettings, foot_patches, on_xsens23
 from wearcap.body.skeletons import smplh52
 from wearcap.boundary.arrays import read_npz, require
 from wearcap.boundary.opening import understood
@@ -35,6 +35,8 @@ from wearcap.io.formats.poses import check_rising
 from wearcap.io.formats.smpl import shape_from_betas, smpl_motion
 from wearcap.scene.objects import centered, check_object_mesh
 
+BEHAVE = MocapSettings(fps=30, limits=CleaningLimits(level_within=0.2))
+"""Bodies were fitted frame by frame, so planted feet's heights spread further than in motion capture."""
 FPS = 30
 """Frame rate (Hz) of the release that has `smpl_fit_all.npz`; the older release has one frame per second in folders."""
 BODY_FILE, OBJECT_FILE, INFO_FILE = "smpl_fit_all.npz", "object_fit_all.npz", "info.json"
@@ -237,7 +239,11 @@ def _level_behave(root: Path, name: str, settings: MocapSettings) -> OneObject:
 
 
 def behave_tasks(
-    source: str | Path, output: str | Path, splits: Splits, settings: MocapSettings, license: str
+    source: str | Path,  # the folder that holds sequences (or behave-30fps-params-v1) and objects
+    output: str | Path,
+    splits: Splits,
+    settings: MocapSettings = BEHAVE,
+    license: str = "BEHAVE licence, non-commercial research (virtualhumans.mpi-inf.mpg.de/behave); not to be passed on",
 ) -> list[Task]:
     """One task per sequence of `source`; environments go to `output`/scenes. The split list's rows are sequences.
 

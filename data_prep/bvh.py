@@ -1,4 +1,4 @@
-"""BVH and ASF/AMC files of any origin; ACCAD, Berkeley MHAD, FuBoT-VR and HDM05 are configs of it."""
+"""BVH or ASF/AMC files of any origin: names, unit, axes and rest pose are detected."""
 
 import re
 import warnings
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from data_prep.shared.engine import NOTE, Splits, Task, source_folder
 from data_prep.shared.hips import find_shift, with_shift
-from data_prep.shared.mocap import About, MocapSettings, mocap_recording
+from data_prep.shared.mocap import MOCAP, About, MocapSettings, mocap_recording
 from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
@@ -93,18 +93,59 @@ def _of_subject(
     return levels, siblings, find_shift(motions, usual_m, levels and levels.R_pelvis)
 
 
+VARIANTS = {
+    "accad": {
+        "about": "ACCAD motion capture (BVH, plain, .xz or .gz), in files that are named PERSON_ACTION.",
+        "subject": r"([A-Za-z]+\d+)_",
+        "activity": r"_([A-Za-z]{3,})",
+        "repair": True,
+        "usual_m": (0.0, 0.012),
+        "license": "CC BY 3.0; motion capture data: Advanced Computing Center for the Arts and Design (ACCAD), The Ohio "
+        "State University.",
+    },
+    "berkeley_mhad": {
+        "about": "Berkeley MHAD's skeletons (BVH, plain, .xz or .gz), in files that are named skl_PERSON_ACTION_REPETITION.",
+        "subject": r"skl_(s\d+)_",
+        "activity": r"skl_s\d+_([a-z0-9]+)",
+        "repair": True,
+        "license": "Copyright (c) 2013, The Regents of the University of California. Read the terms on the data set's page "
+        "before sharing what is trained on it.",
+    },
+    "fubot_vr": {
+        "about": "FuBoT-VR: one person in an inertial suit who plays VR games (BVH, plain, .xz or .gz), in files named "
+        "GAME_NUMBER. The split is by game.",
+        "subject": r"([a-z]+)_\d+",
+        "activity": r"([a-z]+)_\d+",
+        "license": "MIT; FuBoT-VR data set, Tomiha, github.com/Tomiha/FuBoT-VR-Dataset.",
+    },
+    "hdm05": {
+        "about": "HDM05 motion capture (ASF/AMC), plain, .xz or .gz, cut into clips named HDM_PERSON_ACTION_NUMBER_120.",
+        "subject": r"HDM_([a-z]+)_",
+        "activity": r"HDM_[a-z]+_([A-Za-z]+)",
+        "repair": True,
+        "usual_m": (-0.012, 0.013),
+        "license": "CC BY-SA 3.0; the data used in this project was obtained from HDM05 (M. Müller, T. Röder, M. Clausen, "
+        "B. Eberhardt, B. Krüger, A. Weber: Documentation Mocap Database HDM05, Universität Bonn, CG-2007-2, 2007).",
+    },
+}
+"""Data sets in these formats: what they are, and settings that have other defaults."""
+
+
 def bvh_tasks(
-    source: str | Path,
+    source: str | Path,  # a file, or a folder (searched as deep as it goes)
     splits: Splits,
-    settings: MocapSettings,
-    amc_fps: float | int,
-    license: str,
-    hips: Hips,
-    mapping: str | Path | None = None,
+    settings: MocapSettings = MOCAP,
+    amc_fps: float | int = 120,  # not in AMC files
+    license: str = "unknown",  # kept in every recording: say whose data it is
+    repair: bool = False,  # true moves the hip joints so that knees straighten as people's do, per person
+    # the hips' usual shift ahead and up (m), for people who neither walk nor stand
+    usual_m: Sequence[float] = (0.0, 0.0),
+    mapping: str | Path | None = None,  # a YAML file that overrides what is detected: joints, unit, up, forward
+    # null: the number in SUBJECT_TRIAL, else the folder; or a pattern with one group, folder, a name
     subject: str | None = None,
-    activity: str | None = None,
-    unit: str | float | int = AUTO,
-    up: str = AUTO,
+    activity: str | None = None,  # null: none; or a pattern with one group, folder, a name
+    unit: str | float | int = AUTO,  # of length: m, cm, mm, inch …, or metres per unit
+    up: str = AUTO,  # the axis that is up: x, y, z, -x, -y, -z
 ) -> list[Task]:
     """One task per .bvh or .amc (also .xz, .gz) that `source` is or that lies anywhere below it, named by its path.
 
@@ -130,7 +171,7 @@ def bvh_tasks(
     abouts = {name: About(name, subjects[name], "bvh", license, activities[name]) for name in trials}
     given, how = Mapping() if mapping is None else read_mapping(mapping), Conventions(unit=unit, up=up)
     given = replace(given, unit_m=how.unit_m or given.unit_m, up=given.up if how.up == AUTO else how.up)
-    return motion_tasks(trials, abouts, splits, settings, amc_fps, given, hips, VERSION)
+    return motion_tasks(trials, abouts, splits, settings, amc_fps, given, Hips(repair, usual_m), VERSION)
 
 
 def motion_files(source: Path) -> list[Path]:

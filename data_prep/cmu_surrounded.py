@@ -1,4 +1,4 @@
-"""CMU's motion in simulated surroundings, with points and a head camera's video."""
+"""CMU's motion in simulated rooms and streets that fit it, with SLAM points and a head camera's video."""
 
 import zlib
 from collections.abc import Mapping
@@ -65,13 +65,15 @@ def _evenly(names: list[str], count: int) -> list[str]:
 
 
 def cmu_surrounded_tasks(
-    source: str | Path,
     output: str | Path,
     splits: Splits,
-    camera: bool,
-    look_round: bool,
-    seed: int,
-    recordings: Mapping[str, int] | None,
+    source: str | Path = "datasets/cmu",  # data set made by `wearcap prepare cmu`
+    camera: bool = True,  # film the wearer's view (videos/NAME.mp4)
+    # the wearer has turned round on the spot before a recording begins, so that points are available
+    look_round: bool = True,
+    seed: int = 0,
+    # so many of each split, evenly chosen, such as {val: 8, test: 24}; null: all
+    recordings: Mapping[str, int] | None = None,
 ) -> list[Task]:
     """One task per recording of the data set `source`, which `wearcap prepare cmu` made (floors at z = 0), or for
     `recordings[split]` of each split, evenly chosen.

@@ -1,4 +1,4 @@
-"""The EgoHOI data set: objects with annotated poses, contacts with them, and the body that HPS captured.
+"""EgoHOI (smpl_motions/, object_locations/, object_models/, gt_contacts/): people moving scanned objects; bring your own download.
 
 Folders as it unpacks: `smpl_motions/SEQ.json[.zip]`, `smpl_shapes/SUBx.json`, `object_models/OBJECT.ply`, and
 `object_locations` and `gt_contacts` with SEQ.json for one object, SEQ/OBJECT.json for several. A model's vertices are in
@@ -33,6 +33,7 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 
+NONE: dict[str, str] = {}
 VERSION = 1
 """Version of the conversion, increased when the same source and settings yield another recording."""
 MOTION_TYPES = ("hinge", "along_floor", "free", "absent")
@@ -228,13 +229,16 @@ def _egohoi(
 
 
 def egohoi_tasks(
-    source: str | Path,
+    source: str | Path,  # the folder that holds smpl_motions and the others
     output: str | Path,
     splits: Splits,
-    motion_types: dict[str, str],
-    object_names: dict[str, str],
-    fps: float | int,
-    license: str,
+    # by pattern of object names, the first that matches: hinge, along_floor, free or absent
+    # (+motion_types.OBJECT=free); otherwise objects with a hinge turn and all others slide
+    motion_types: dict[str, str] = NONE,
+    # by sequence, for single-object sequences that are not named after their model
+    object_names: dict[str, str] = NONE,
+    fps: float | int = 30,  # bodies (HPS's estimates) are brought to this rate; objects keep their annotations
+    license: str = "EgoHOI licence (virtualhumans.mpi-inf.mpg.de/ireplica); not to be passed on",
 ) -> list[Task]:
     """One task per sequence in `source`/smpl_motions; environments go to `output`/scenes.
 

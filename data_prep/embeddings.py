@@ -1,4 +1,4 @@
-"""Adding image embeddings to the recordings of an existing data set.
+"""Image embeddings for the recordings of a data set with head camera pictures: dataset=DIR encoder=egoview, clip or dinov2.
 
 This does not use the task engine: a failure must leave the recording in its data set, and a large encoder is loaded once.
 """
@@ -8,12 +8,29 @@ from pathlib import Path
 
 from data_prep.shared.engine import Report, check_recording, registering
 from wearcap.data.embeddings import embed_camera, embedding_name
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.files import remove_leftovers
 from wearcap.locks import folder_lock
-from wearcap.models.image_encoder import ImageEncoder
+from wearcap.models.image_encoder import Clip, DinoV2, EgoViewEncoder, ImageEncoder
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import Entry, RecordingFile, RecordingStore, save_recording
+
+
+def embeddings_rework(
+    dataset: str | Path,  # a folder that `wearcap prepare` made; its recordings are rewritten one by one
+    # egoview, clip (the paper's, by open_clip) or dinov2 (by timm): pip install "wearcap[images]"
+    encoder: str = "egoview",
+    checkpoint: str = "egoview",  # of egoview: a checkpoint's name or file
+    # of clip and dinov2: a file; null: $WEARCAP_CLIP_WEIGHTS, $WEARCAP_DINOV2_WEIGHTS or the user's caches
+    weights: str | None = None,
+    cache: str | Path | None = None,  # where embeddings are kept by content of the pictures; null: dataset/cache
+    overwrite: bool = False,
+) -> Report:
+    """Embeddings by one of the encoders, added by `embed_dataset`. Raises WearcapError for another one."""
+    require_choice(encoder, ("egoview", "clip", "dinov2"), f"no image encoder {encoder!r}")
+    if encoder == "egoview":
+        return embed_dataset(dataset, EgoViewEncoder.load(checkpoint), cache, overwrite)
+    return embed_dataset(dataset, {"clip": Clip, "dinov2": DinoV2}[encoder](weights), cache, overwrite)
 
 
 def embed_dataset(

@@ -1,4 +1,4 @@
-"""The H-contact data set: bodies by sequence, contacts of each hand, and the published split of windows.
+"""H-contact (body/, contacts/, splits/): poses with annotated contacts of both hands; bring your own download.
 
 Folders as it unpacks: `body/NAME.json.zip`, `contacts/NAME.json`, and, from the published code, `splits/…/NAME.json`.
 Bodies, as EgoHOI's, are SMPL or SMPL+H poses frame by frame, as `.json.zip` or older `.json`: the world is metric and z
@@ -31,6 +31,7 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 from wearcap.scene.objects import CONTACT_CLASSES
 
+CLASSES = {"*door*": "hinged", "*window*": "hinged", "*": "sliding"}
 VERSION = 1
 """Version of the conversion, increased when the same source and settings yield another recording."""
 _BODY = 63
@@ -166,7 +167,11 @@ def _hcontact(root: Path, name: str, contact_class: str, fps: float | int, licen
 
 
 def hcontact_tasks(
-    source: str | Path, splits: Splits, classes: dict[str, str], fps: float | int, license: str
+    source: str | Path,  # the folder that holds body and contacts
+    splits: Splits,
+    classes: dict[str, str] = CLASSES,  # contact class by sequence name, the first pattern that matches
+    fps: float | int = 60,  # motions are brought to this rate; contacts keep their times
+    license: str = "H-contact licence (virtualhumans.mpi-inf.mpg.de/ireplica); not to be passed on",
 ) -> list[Task]:
     """One task per sequence in `source`/body; `classes` maps patterns of names to contact classes, the first match decides.
 

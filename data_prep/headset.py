@@ -1,10 +1,12 @@
-"""Logs of headsets with controllers or hands."""
+"""Logs of headsets with controllers or hands (Quest, Vive, Pico; OpenXR, Unity, SteamVR): CSV, JSON, JSON lines."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from data_prep.shared.engine import Splits, Task
 from data_prep.trajectory import log_task
 from wearcap.errors import WearcapError
+from wearcap.io.conventions import AUTO
 from wearcap.io.devices.headset_log import is_headset_log, is_headset_session
 from wearcap.prepare.logs import HeadsetSettings
 from wearcap.recording.recording import Recording
@@ -18,12 +20,28 @@ def _headset(path: Path, name: str, about: dict[str, str], settings: HeadsetSett
 
 
 def headset_tasks(
-    source: str | Path, splits: Splits, subject: str, license: str, settings: HeadsetSettings
+    source: str | Path,  # a log, or a folder of logs
+    splits: Splits,
+    subject: str = "wearer",
+    license: str = "the recording's own",
+    # of the wearer (m); null: from how high the head is carried, when it is captured
+    height: float | int | None = None,
+    unit: str | float | int = AUTO,  # of length: m, cm, mm, or metres per unit
+    # unity (left-handed, y up), openxr (right-handed, y up, -z forward), steamvr (as openxr), unreal (left-handed, z
+    # up)
+    axes: str = AUTO,
+    quaternion: str = AUTO,  # order where columns do not name it: xyzw, wxyz
+    # wrist: OpenXR's hand joint; a controller: grip (OpenXR's pose), pointer (forward along the arm)
+    hands: str = AUTO,
+    time_unit: str | None = None,  # s, ms, us, ns; null: from the numbers
+    # headset on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: [0.09,0,0.075]
+    T_head_device: Sequence[float | int] | None = None,
 ) -> list[Task]:
     """One task per log: a file, or each in a folder. Raises WearcapError where there is none."""
     source = Path(source)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
+    settings = HeadsetSettings(unit, axes, quaternion, hands, time_unit, T_head_device, height)
     kinds = (".csv", ".tsv", ".json", ".jsonl", ".txt", ".bsor")
     found = [source]
     if source.is_dir() and not is_headset_session(source):

@@ -1,4 +1,4 @@
-"""The HPS data set: suits, localised head cameras and scans."""
+"""HPS data set as it unpacks (hps_smpl, hps_betas, hps_inits, head_camera_localizations, …); bring your own download."""
 
 from dataclasses import replace
 from functools import partial
@@ -28,7 +28,13 @@ def _hps(root: Path, name: str, fps: float | int, camera_hz: float | int, licens
     )
 
 
-def hps_tasks(source: str | Path, splits: Splits, fps: float | int, camera_hz: float | int, license: str) -> list[Task]:
+def hps_tasks(
+    source: str | Path,  # the folder that holds hps_smpl and the others (scans unzipped in scans/)
+    splits: Splits,
+    fps: float | int = 30,  # motion, suit and localisation are brought to this rate
+    camera_hz: float | int = 30,  # of the video that was localised; 29.97 where it was not resampled
+    license: str = "HPS dataset licence; not to be passed on",
+) -> list[Task]:
     """One task per sequence in `source`/hps_smpl; hashed by all files with its name and its subject's betas."""
     source = source_folder(source)
     names = hps_names(source)

@@ -1,4 +1,4 @@
-"""Adding head-camera keypoints to the recordings of a data set: detected in its pictures, recorded, or simulated.
+"""Keypoints of the head camera beside a data set's recordings: dataset=DIR detector=mediapipe, recorded (file=PATH) or simulated.
 
 Videos and scenes of the old data set are linked into the new one.
 """
@@ -14,7 +14,7 @@ import numpy as np
 
 from data_prep.shared.engine import Report, Task, prepare
 from wearcap.data.embeddings import pictures
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.files import content_hash
 from wearcap.localization.keypoint_flow import FlowSettings, tracked_cues
 from wearcap.localization.keypoints import MediaPipeHands, RecordedDetections, find_model, read_keypoints
@@ -25,6 +25,7 @@ from wearsim.sensors.keypoints import action_camera, camera_path, seen_joints
 
 VERSION = 2
 """Version of the conversion, increased when the same recording and settings yield another one."""
+FLOW = FlowSettings()
 CAMERA_FPS = 30.0
 """Rate (Hz) of the simulated camera of a recording without one."""
 
@@ -102,6 +103,34 @@ class Simulated:
 Source = Found | Recorded | Simulated
 """Source of keypoints, picklable: called with a recording and its data set's folder, it returns the recording with cues;
 `settings(name)` is the content that the cues of the recording of this name depend on (for `engine.content_hash`)."""
+
+
+def keypoints_rework(
+    dataset: str | Path,  # a folder made by `wearcap prepare`; the new data set refers to its videos and scenes
+    output: str | Path,
+    detector: str = "mediapipe",  # pip install "wearcap[hands]"; recorded: files; simulated: of the true motion
+    model: str | None = None,  # for mediapipe: hand_landmarker.task; null: $WEARCAP_HANDS_MODEL
+    # for recorded: a folder with NAME.csv (timestamp, joint, x, y[, z], confidence), or one .csv
+    file: str | None = None,
+    joints: Sequence[str] = ("left_wrist", "right_wrist"),  # for simulated
+    noise_px: float | int = 4.0,
+    drop: float | int = 0.1,  # share of simulated keypoints that are missed
+    seed: int = 0,
+    # optical flow where detections are missing: flow.reach (frames; 0: none), flow.window_px
+    flow: FlowSettings = FLOW,
+    jobs: int = 1,
+    backend: str = "loky",
+    scheduler: str | None = None,
+    overwrite: bool = False,
+) -> Report:
+    """Keypoints by one of the detectors, added by `keypoints_dataset`. Raises WearcapError for another one."""
+    require_choice(detector, ("mediapipe", "recorded", "simulated"), f"no detector {detector!r}")
+    source: Source = Simulated(joints, noise_px, drop, seed)
+    if detector != "simulated":
+        source = Found(model, flow) if detector == "mediapipe" else Recorded(file, flow)
+    return keypoints_dataset(
+        dataset, output, source, jobs=jobs, backend=backend, scheduler=scheduler, overwrite=overwrite
+    )
 
 
 def keypoints_dataset(

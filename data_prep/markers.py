@@ -1,14 +1,14 @@
-"""Optical markers (TRC files; UI-PRMD is a config of it): a person's body from several trials, then the motion of each."""
+"""Optical markers in TRC files, named as in Vicon's Plug-in Gait: a body per person, then its motion."""
 
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 
 from data_prep.shared.engine import NOTE, Splits, Task, source_folder
-from data_prep.shared.mocap import About, MocapSettings, mocap_recording
-from data_prep.ui_prmd import read_ui_prmd
+from data_prep.shared.mocap import MOCAP, About, MocapSettings, mocap_recording
 from wearcap.boundary.opening import placed, understood
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
@@ -21,6 +21,8 @@ VERSION = 1
 """Version of the fit, increased when the same source and settings yield another recording."""
 
 
+Read = Callable[[Path, Conventions], Markers]
+"""Reader of a file."""
 BODY_TRIALS = 24
 """Number of a person's trials from which bones and places of markers are estimated."""
 
@@ -29,32 +31,48 @@ LARGEST_RMS_M = 0.015
 """Root mean square of the markers' distances from the body above which a trial gets a note."""
 
 
+def markers_tasks(
+    source: str | Path,  # the folder with the .trc files (searched as deep as it goes)
+    splits: Splits,
+    settings: MocapSettings = MOCAP,
+    license: str = "unknown",  # kept in every recording: say whose data it is
+    files: str = "*.trc*",  # their names
+    subject: str | None = None,  # null: the folder; or a pattern with one group, a name
+    activity: str | None = None,  # null: none; or a pattern with one group, a name
+    unit: str | float | int = AUTO,  # of length: what the file says; or m, cm, mm, inch …, or metres per unit
+    up: str = AUTO,  # the axis that is up: x, y, z; auto is y
+) -> list[Task]:
+    """One task per file below `source` whose name matches the pattern `files`, named by its path; a body per subject.
+
+    `subject` and `activity` are each a regular expression with one group, searched in the path below `source`, or one name
+    for all. By default the subject is the folder, and there is no activity.
+    """
+    how = Conventions(unit=unit, up=up)
+    return marker_tasks("markers", source, splits, settings, license, files, (subject, activity), {}, how, read_trc)
+
+
 def marker_tasks(
+    origin: str,
     source: str | Path,
     splits: Splits,
     settings: MocapSettings,
     license: str,
     files: str,
-    origin: str,
-    subject: str | None = None,
-    activity: str | None = None,
-    activities: dict[str, str] | None = None,
-    unit: str | float | int = AUTO,
-    up: str = AUTO,
+    rules: tuple[str | None, str | None],
+    activities: dict[str, str],
+    how: Conventions,
+    read: Read,
 ) -> list[Task]:
-    """One task per file below `source` whose name matches the pattern `files`, named by its path; a body per subject.
-
-    `subject` and `activity` are each a regular expression with one group, searched in the path below `source`, or one name
-    for all; `activities` may replace what the group finds. By default the subject is the folder, and there is no activity.
-    """
-    source, how = source_folder(source), Conventions(unit=unit, up=up)
+    """The same of files that `read` reads, of the data set `origin`; `rules` are of subject and activity, and `activities`
+    may replace what the latter finds."""
+    source = source_folder(source)
     abouts, persons = dict[Path, About](), dict[str, list[Path]]()
     for path in sorted(source.rglob(files)):
         below = path.relative_to(source)
         name = "__".join([*below.parent.parts, path.name.split(".")[0]]).replace(" ", "_")
         folder = below.parent.as_posix() if below.parent.parts else source.resolve().name
-        who, what = _found(below, "subject", subject) or folder, _found(below, "activity", activity)
-        abouts[path] = About(name, who, origin, license, (activities or {}).get(what, what))
+        who, what = _found(below, "subject", rules[0]) or folder, _found(below, "activity", rules[1])
+        abouts[path] = About(name, who, origin, license, activities.get(what, what))
         persons.setdefault(who, []).append(path)
     if not abouts:
         raise WearcapError(f"no files {files}", where=source, expected="marker files, plain or .xz or .gz")
@@ -63,7 +81,7 @@ def marker_tasks(
     return [
         Task(
             about.name,
-            partial(_recording, path, about, settings, how, spread[about.subject]),
+            partial(_recording, path, about, settings, how, read, spread[about.subject]),
             splits.of(about.subject),
             content_hash(asdict(about), digests[about.subject], path),
         )
@@ -81,27 +99,23 @@ def _found(below: Path, what: str, rule: str | None) -> str:
         return re.compile(rule).findall(below.as_posix())[-1]
 
 
-def _read(path: Path, how: Conventions) -> Markers:
-    return read_trc(path, how) if ".trc" in path.name.lower() else read_ui_prmd(path)
-
-
 @cache
-def _body(files: tuple[Path, ...], how: Conventions) -> MarkerBody:
+def _body(files: tuple[Path, ...], how: Conventions, read: Read) -> MarkerBody:
     """The body of a person, from the readable ones of several trials."""
     trials = []
     for file in files:
         with suppress(WearcapError):  # reported by the trial's own task
-            trials.append(_read(file, how))
+            trials.append(read(file, how))
     return fit_body(trials)
 
 
 def _recording(
-    path: Path, about: About, settings: MocapSettings, how: Conventions, files: tuple[Path, ...]
+    path: Path, about: About, settings: MocapSettings, how: Conventions, read: Read, files: tuple[Path, ...]
 ) -> Recording:
     """One trial, fitted with its person's body; the provenance keeps how far the markers are from it."""
-    markers = _read(path, how)
+    markers = read(path, how)
     with placed(path):
-        body = _body(files, how)
+        body = _body(files, how, read)
         motion, distance = fit_motion(body, markers)
     rms, each = distance.square().nanmean().sqrt().item(), distance.square().nanmean(0).nan_to_num(0.0)
     unknown = [name for name in markers.names if plug_in_gait(name) not in MARKERS]

@@ -1,4 +1,4 @@
-"""MocapEvery's capture folder: a SLAM trajectory and points, the head camera's video, and two watches' logs.
+"""MocapEvery's capture folders (cam_traj.pkl, sfm/, video/, watch_sensorlog_1.csv and _2.csv); bring your own captures.
 
 Camera poses are of an OpenCV camera in SLAM's own world, whose unit and axes are arbitrary until the calibration board
 fixes them (appendix C.2): the wearer's camera was carried along the board's x and y edges, whose lengths are known.
@@ -222,11 +222,8 @@ class MocapEverySettings:
     """Settings of the conversion of a capture folder to a recording in metres, z up."""
 
     scale: float | int | None
-    """Metres per unit of SLAM, with the first camera pose taken as level; None: from the calibration board."""
     height_m: float | int
-    """Height (m) of the first camera pose above the floor, used with `scale`."""
     max_acceleration: float | int
-    """Acceleration (m/s²) beyond which camera poses are outliers."""
     max_burst_s: float | int
 
     def alignment(self, read: MocapEveryFolder, folder: Path) -> tuple[float, Rigid]:
@@ -258,10 +255,18 @@ def _mocap_every(folder: Path, name: str, subject: str, settings: MocapEverySett
 
 
 def mocap_every_folder_tasks(
-    source: str | Path, splits: Splits, subject: str, settings: MocapEverySettings, license: str
+    source: str | Path,  # a capture folder, or one that holds such folders
+    splits: Splits,
+    subject: str = "wearer",
+    license: str = "the recording's own",
+    # metres per unit of SLAM, the first camera pose taken as level; null: from the board
+    scale: float | int | None = None,
+    height_m: float | int = 1.6,  # height of the first camera pose above the floor, if scale is given
+    max_acceleration: float | int = 40.0,  # camera poses that accelerate more (m/s²) are outliers, and interpolated
+    max_burst_s: float | int = 1.0,  # a longer stretch that deviates is no burst of outliers
 ) -> list[Task]:
     """One task per capture folder at or below `source`; hashed by all files read, a video by its size."""
-    source = source_folder(source)
+    source, settings = source_folder(source), MocapEverySettings(scale, height_m, max_acceleration, max_burst_s)
     folders = [path for path in sorted([source, *source.rglob("*")]) if is_mocap_every_folder(path)]
     if not folders:
         raise WearcapError("no capture", where=source, expected="folders with cam_traj.pkl")

@@ -1,4 +1,4 @@
-"""A suit's captures (MVNX): alone, or with the head camera's video, its localisation and the scene's scan."""
+"""Xsens takes (MVNX): alone, or with the head camera's video, where it was localised, and the scene's scan."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -29,18 +29,12 @@ class SuitSettings:
 
     video: str | None = None
     camera: str | None = None
-    """Intrinsics (camera.json) of the video, or of the pictures that were localised."""
     video_start_s: float | int = 0.0
-    """Time of the video's first frame on the suit's clock; claps correct it when the recording is captured."""
     T_head_cam: Sequence[float | int] | None = None
-    """The camera on the head joint; None: upright on the forehead."""
     camera_poses: str | None = None
-    """Poses of the camera in the scene, of any format of trajectories, in metres and on the video's clock."""
     time_unit: str | None = None
     fps: float | int | None = None
-    """Rate of the localised pictures, for files with frame numbers or no times."""
     scene: str | None = None
-    """Scan of the scene, or its folder."""
 
     def files(self) -> list[Path]:
         """The other files that a recording is made of; a video counts by its size."""
@@ -88,12 +82,28 @@ def _suit(path: Path, name: str, about: dict[str, str], settings: SuitSettings) 
     return replace(recording, name=name, camera=camera, localization=localization, scene=scene, **about)
 
 
-def suit_tasks(source: str | Path, splits: Splits, subject: str, license: str, settings: SuitSettings) -> list[Task]:
+def mvnx_tasks(
+    source: str | Path,  # a take, or a folder of takes
+    splits: Splits,
+    subject: str = "wearer",
+    license: str = "the recording's own",
+    video: str | None = None,  # the head camera's video, and its intrinsics (wearcap calibrate source=VIDEO)
+    camera: str | None = None,  # camera.json
+    video_start_s: float | int = 0.0,  # of its first frame on the suit's clock; claps correct it in the capture
+    # camera on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: upright on the forehead
+    T_head_cam: Sequence[float | int] | None = None,
+    # the camera's poses in the scene (TUM, EuRoC, COLMAP, hloc, DROID-SLAM …), in metres
+    camera_poses: str | None = None,
+    time_unit: str | None = None,  # of these: s, ms, us, ns; null: from the numbers
+    fps: float | int | None = None,  # of the video, for poses with frame numbers or no times
+    scene: str | None = None,  # the scene's scan, or its folder
+) -> list[Task]:
     """One task per MVNX file: a file, or each in a folder.
 
     Raises WearcapError where there is none, for a video or localisation of several takes, and for one without intrinsics.
     """
     source = Path(source)
+    settings = SuitSettings(video, camera, video_start_s, T_head_cam, camera_poses, time_unit, fps, scene)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
     if settings.camera is None and (settings.video or settings.camera_poses):
@@ -109,13 +119,13 @@ def suit_tasks(source: str | Path, splits: Splits, subject: str, license: str, s
     if len(found) > 1 and (settings.files() or settings.video):
         what = f"{len(found)} takes, but a video or localisation of one"
         raise WearcapError(what, where=source, fix="Prepare that one alone: source=FILE.")
-    video = [] if settings.video is None else [str(Path(settings.video).stat().st_size)]
+    sizes = [] if settings.video is None else [str(Path(settings.video).stat().st_size)]
     map_beside = [] if settings.scene is None else used_files(cloud_file(settings.scene))[1:]
     tasks = []
     for path in found:
         name = path.name.split(".")[0]
         about = {"subject": subject, "license": license, "source": f"mvnx {path.name}"}
-        key = content_hash(name, about, asdict(settings), VERSION, *video, path, *settings.files(), *map_beside)
+        key = content_hash(name, about, asdict(settings), VERSION, *sizes, path, *settings.files(), *map_beside)
         make = partial(_suit, path, name, about, settings)
         tasks.append(Task(name, make, splits.of(subject), key))
     return tasks

@@ -1,4 +1,4 @@
-"""Nymeria and NymeriaPlus: an Xsens suit under Project Aria glasses."""
+"""Nymeria or NymeriaPlus (one folder per sequence: body/, recording_head/); bring your own download."""
 
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,14 @@ VERSION = 2
 
 
 def nymeria_tasks(
-    source: str | Path, splits: Splits, fps: float | int, license: str, camera: bool = False, output: str = "."
+    source: str | Path,  # the folder that holds the sequences' folders
+    splits: Splits,
+    fps: float | int = 60.0,
+    license: str = "Nymeria dataset licence; not to be passed on",
+    # video of the head camera, 256x256 pixels, for sequences with recording_head/data/data.vrs: output/videos (needs
+    # wearcap[aria])
+    camera: bool = False,
+    output: str = ".",
 ) -> list[Task]:
     """One task per sequence folder (with `body/xdata.npz`) below `source`; hashed by its motion, head path and points.
 

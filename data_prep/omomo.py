@@ -1,4 +1,4 @@
-"""OMOMO: a person and one of fifteen objects, from optical motion capture.
+"""OMOMO (train_… and test_diffusion_manip_seq_joints24.p, captured_objects/): people handling one of fifteen objects; bring your own download.
 
 `train_diffusion_manip_seq_joints24.p` and `test_…` are joblib files of {number: sequence}, read with the restricted
 unpickler; `captured_objects/OBJECT_cleaned_simplified.obj` are the meshes. World: metres, z up. No file has the frame
@@ -34,6 +34,8 @@ from wearcap.io.formats.smpl import shape_from_arrays, smpl_motion
 from wearcap.io.formats.wavefront import read_obj
 from wearcap.scene.objects import centered, check_object_mesh
 
+OMOMO = MocapSettings(fps=30)
+"""Faster files are brought to this rate, body and object alike."""
 FILES = ("train_diffusion_manip_seq_joints24.p", "test_diffusion_manip_seq_joints24.p")
 MESHES, MESH_ENDING = "captured_objects", "_cleaned_simplified.obj"
 _TWO_PARTS = ("mop", "vacuum")
@@ -196,12 +198,13 @@ WALKED_M = 1.0
 
 
 def omomo_tasks(
-    source: str | Path,
+    source: str | Path,  # the folder that holds the .p files (one of them is enough) and captured_objects
     output: str | Path,
     splits: Splits,
-    settings: MocapSettings,
-    source_fps: float | int,
-    license: str,
+    settings: MocapSettings = OMOMO,
+    # not in the files; public loaders use 30 or 120; refused if people would not walk at human speeds
+    source_fps: float | int = 30,
+    license: str = "OMOMO, research use only (lijiaman.github.io/projects/omomo); not to be passed on",
 ) -> list[Task]:
     """One task per sequence of `source`'s files; environments go to `output`/scenes.
 

@@ -1,4 +1,4 @@
-"""The simulated wearers' recordings (HMD², MocapEvery): nothing to download, the same bytes for the same seed."""
+"""The simulated wearer (HMD², MocapEvery), nothing to download; preset=quick (6 minutes of motion) or preset=standard (5 hours)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -14,6 +14,11 @@ from wearcap.files import content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS
 from wearsim.recordings.simulate import SimulationConfig, simulate_recording
+
+PRESETS = {
+    "quick": {"recordings": {"train": 8, "val": 2, "test": 2}, "duration_s": 30},
+    "standard": {"recordings": {"train": 120, "val": 10, "test": 20}, "duration_s": 120},
+}
 
 
 def source_files() -> str:
@@ -52,13 +57,14 @@ def split_tasks(
 
 def simulated_tasks(
     splits: Splits,
-    recordings: dict[str, int],
-    duration_s: float | int,
-    fps: float | int,
-    points: bool,
-    activities: list[str] | None,
-    seed: int,
-    world: str | None = None,
+    recordings: dict[str, int],  # how many in each split
+    duration_s: float | int,  # length of each
+    fps: float | int = 60,
+    points: bool = True,  # points that a head-worn SLAM system would observe
+    activities: list[str] | None = None,  # a list of them, done in turn; null: drawn at random
+    seed: int = 0,
+    world: str | None = None,  # flat, outdoor, or null: drawn, three in ten outdoors
+    # render the head camera's video (96x72 pixels, 30 Hz), with the wearer's own arms and legs: output/videos
     camera: bool = False,
     output: str = ".",
 ) -> list[Task]:

@@ -1,5 +1,6 @@
-"""Simulated HPS sessions: long walks in scanned sites."""
+"""Simulated HPS sessions: suit, wrist sensors, head camera, localisation, scanned sites; preset=quick (one walk, scan of 2 cm, about 500 photos, half a minute of video) or preset=standard."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import pairwise
@@ -20,6 +21,11 @@ from wearsim.rendering.head_camera import HEAD_CAMERA_TRUTH, Filming, write_head
 from wearsim.rendering.scan import SceneSettings, write_scene
 from wearsim.rendering.views import Scenery
 from wearsim.sensors.suit import SuitNoise
+
+PRESETS = {
+    "quick": {"recordings": {"test": 1}, "spacing_m": 0.02, "photo_m": 2.6, "video_s": 30},
+    "standard": {"recordings": {"train": 2, "val": 3, "test": 5}, "spacing_m": 0.015, "photo_m": 1.8, "video_s": 60},
+}
 
 
 def _hps(
@@ -55,25 +61,26 @@ def _hps(
 def simulated_hps_tasks(
     splits: Splits,
     output: str,
-    recordings: dict[str, int],
-    fps: float | int,
-    camera_fps: float | int,
-    suit: str,
-    localization: str,
-    returns_m: list[float],
-    end_m: float | int,
-    spacing_m: float | None,
-    photo_m: float | int,
-    video_s: float | None,
-    video_fps: float | int,
-    changed: float | int,
-    seed: int,
+    recordings: dict[str, int],  # how many in each split
+    spacing_m: float | None,  # between points of the scan; null: no scenes
+    photo_m: float | int,  # between the photo rig's stations; 0: no photos
+    video_s: float | int | None,  # filmed duration (s) of each head camera; 0: none, null: all
+    fps: float | int = 60,  # suit and wrist sensors
+    camera_fps: float | int = 30,
+    suit: str = "typical",  # errors of the suit: ideal, typical or poor
+    camera_errors: str = "typical",  # errors of the camera's localisation and its map: ideal, typical or poor
+    # distances travelled after which the wearer is back at the capture spot
+    returns_m: Sequence[float | int] = (70, 200, 380),
+    end_m: float | int = 410,
+    video_fps: float | int = 5,
+    changed: float | int = 0.3,  # share of the movable objects that were moved or removed since the scan
+    seed: int = 0,
 ) -> list[Task]:
     """`recordings[split]` sessions each; people and sites of the splits never meet, and a split's sites are few.
 
     Scenes go to `output`/scenes: points `spacing_m` apart (None: no scene at all), photo stations `photo_m` apart
     (0: no photos). The first `video_s` (None: all) of each head camera are filmed at `video_fps`. `suit` and
-    `localization` name presets of errors. Raises WearcapError as `simulated_tasks` does, for a preset that does not
+    `camera_errors` name presets of errors. Raises WearcapError as `simulated_tasks` does, for a preset that does not
     exist, and for distances that do not rise.
     """
     distances = [0.0, *map(float, returns_m), float(end_m)]
@@ -85,7 +92,7 @@ def simulated_hps_tasks(
         camera_fps=float(camera_fps),
         protocol=protocol,
         suit=SuitNoise.preset(suit),
-        localization=LocalizationNoise.preset(localization),
+        localization=LocalizationNoise.preset(camera_errors),
     )
     scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
     seconds = None if video_s is None else float(video_s)

@@ -1,4 +1,4 @@
-"""Simulated iReplica sessions: doors, windows, drawers and furniture in scanned flats."""
+"""Simulated iReplica sessions: suit, head camera's localisation, scanned flats with objects that are moved; preset=quick or preset=standard."""
 
 import json
 import zlib
@@ -25,6 +25,10 @@ from wearsim.rendering.scan import scan_world
 from wearsim.rendering.views import Scenery
 from wearsim.sensors.suit import SuitNoise
 
+PRESETS = {
+    "quick": {"recordings": {"train": 6, "val": 2, "test": 2}, "minutes": 2, "spacing_m": 0.03},
+    "standard": {"recordings": {"train": 48, "val": 6, "test": 10}, "minutes": 3, "spacing_m": 0.02},
+}
 MADE = "made.json"
 """File in a scene's folder that holds the settings with which it was made."""
 
@@ -68,20 +72,20 @@ def in_flat(
 def simulated_interactions_tasks(
     splits: Splits,
     output: str,
-    recordings: dict[str, int],
-    minutes: float | int,
-    fps: float | int,
-    camera_fps: float | int,
-    suit: str,
-    localization: str,
-    measured: bool,
-    spacing_m: float | int,
-    seed: int,
+    recordings: dict[str, int],  # how many in each split
+    minutes: float | int,  # of each recording
+    spacing_m: float | int,  # between points of the scans
+    fps: float | int = 60,  # of the suit
+    camera_fps: float | int = 30,
+    suit: str = "typical",  # errors of the suit: ideal, typical or poor
+    camera_errors: str = "typical",  # errors of the camera's localisation and its map: ideal, typical or poor
+    measured: bool = True,  # objects 2 cm and 2° from where the environment says, hinges 1.5 cm; false: exactly there
+    seed: int = 0,
 ) -> list[Task]:
     """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
 
     Scenes go to `output`/scenes, with points `spacing_m` apart; `measured` environments have the errors of measuring.
-    `suit` and `localization` name presets of errors. Raises WearcapError as `simulated_tasks` does, and for a preset that does not exist.
+    `suit` and `camera_errors` name presets of errors. Raises WearcapError as `simulated_tasks` does, and for a preset that does not exist.
     """
     if not spacing_m > 0:
         raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
@@ -90,7 +94,7 @@ def simulated_interactions_tasks(
         camera_fps=float(camera_fps),
         minutes=float(minutes),
         suit=SuitNoise.preset(suit),
-        localization=LocalizationNoise.preset(localization),
+        localization=LocalizationNoise.preset(camera_errors),
     )
     make = partial(in_flat, simulate_interactions, config, float(spacing_m), measured, source_files())
     return split_tasks(

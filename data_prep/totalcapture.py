@@ -1,4 +1,4 @@
-"""TotalCapture: Vicon's body and thirteen Xsens sensors."""
+"""TotalCapture as it unpacks (Vicon's ground truth and the Xsens sensors with AuxFields, below s1 … s5); bring your own download."""
 
 from dataclasses import asdict, replace
 from functools import partial
@@ -8,7 +8,7 @@ import roma
 import torch
 
 from data_prep.shared.engine import NOTE, Splits, Task, source_folder
-from data_prep.shared.mocap import About, MocapSettings, mocap_recording, on_xsens23, without_glitches
+from data_prep.shared.mocap import MOCAP, About, MocapSettings, mocap_recording, on_xsens23, without_glitches
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.geometry import rotation
@@ -52,7 +52,12 @@ def _mounted(stream: ImuStream, motion: Motion, where: Path) -> ImuStream:
     return replace(stream, timestamps=stream.timestamps[inside] - first, R_joint_imu=mount, **parts)
 
 
-def totalcapture_tasks(source: str | Path, splits: Splits, settings: MocapSettings, license: str) -> list[Task]:
+def totalcapture_tasks(
+    source: str | Path,  # the folder that holds the subjects' folders, of Vicon and of the sensors
+    splits: Splits,
+    settings: MocapSettings = MOCAP,
+    license: str = "TotalCapture licence (cvssp.org/data/totalcapture); not to be passed on",
+) -> list[Task]:
     """One task per sequence with all its files at or below `source`, named SUBJECT_ACTION."""
     source = source_folder(source)
     found = totalcapture_files(source)

@@ -1,4 +1,4 @@
-"""The path of a head's own device by any SLAM."""
+"""A head device's trajectory, known by its content: TUM, EuRoC, COLMAP, hloc, DROID-SLAM, MPS, KITTI, ARKit, NeRF."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -9,6 +9,7 @@ from typing import Any
 from data_prep.shared.engine import Splits, Task
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
+from wearcap.io.conventions import AUTO
 from wearcap.io.devices.aria_mps import is_mps_folder
 from wearcap.io.formats.trajectory import trajectory_file, trajectory_format
 from wearcap.prepare.logs import TrajectorySettings, log_name, read_path
@@ -19,13 +20,43 @@ VERSION = 2
 
 
 def trajectory_tasks(
-    source: str | Path, splits: Splits, subject: str, license: str, settings: TrajectorySettings
+    source: str | Path,  # a file, a folder of COLMAP, DROID-SLAM or MPS, or a folder of such files
+    splits: Splits,
+    subject: str = "wearer",
+    license: str = "the recording's own",
+    # of the wearer (m); null: from how high the head is carried, when it is captured
+    height: float | int | None = None,
+    up: str = AUTO,  # the world's up axis: z, y, -y, x, -x, -z
+    axes: str = AUTO,  # of the device: camera (x right, y down), head (x forward, z up), openxr (x right, y up)
+    time_unit: str | None = None,  # s, ms, us, ns; null: from the numbers
+    fps: float | int | None = None,  # of the video, for files with frame numbers or no times
+    # of length: m, cm, mm …, or metres per unit; auto: 1, or from points, head_imu or walks
+    unit: str | float | int = AUTO,
+    # device on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: glasses, [0.09,0,0.075]
+    T_head_device: Sequence[float | int] | None = None,
+    points: str | None = None,  # .ply, .pcd or a table x, y, z in the trajectory's world
+    # [from,to] (s from the first pose) upright; with points and camera_height_m the floor gives scale and vertical
+    standing: Sequence[float | int] | None = None,
+    camera_height_m: float | int | None = None,  # height of the camera above the floor while standing
+    head_imu: str | None = None,  # log of an inertial sensor on the camera, on its clock: scale and vertical
+    T_cam_imu: Sequence[float | int] | None = None,  # its pose in the camera, as T_head_device; null: the same axes
+    walks: Sequence[Sequence[float | int]] | None = None,  # straight walks: [[from,to,metres],…], for the scale
+    video: str | None = None,  # the head camera's video, and its intrinsics (wearcap calibrate)
+    camera: str | None = None,  # camera.json
+    video_start_s: float | int = 0.0,  # time of its first frame after the first pose
+    max_acceleration: float | int = 40.0,
+    max_burst_s: float | int = 1.0,
 ) -> list[Task]:
     """One task per trajectory: a file, a folder that is one, or each trajectory in a folder.
 
+    Poses that accelerate more than `max_acceleration` (m/s²) are outliers, and interpolated, unless they last longer than
+    `max_burst_s`.
     Raises WearcapError where there is none, and for points, a video or an inertial log of several trajectories.
     """
     source = Path(source)
+    evidence = points, standing, camera_height_m, head_imu, T_cam_imu, walks
+    path, clean = (up, axes, time_unit, fps, unit, T_head_device, height), (max_acceleration, max_burst_s)
+    settings = TrajectorySettings(*path, *evidence, video, camera, video_start_s, *clean)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
     if source.is_dir() and not is_mps_folder(source) and trajectory_file(source) is None:

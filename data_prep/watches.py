@@ -1,5 +1,6 @@
-"""Two watches and a head camera's trajectory."""
+"""Two watches' logs and a head camera's trajectory, with the calibration of wearcap calibrate steps=watches."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -7,6 +8,7 @@ from data_prep.shared.engine import Splits, Task
 from data_prep.trajectory import log_task
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
+from wearcap.io.conventions import AUTO
 from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.trajectory import read_trajectory_file
 from wearcap.prepare.logs import TrajectorySettings, head_of, origin_of
@@ -72,9 +74,25 @@ class WatchesSettings:
 
 
 def watches_tasks(
-    camera: str | Path, splits: Splits, subject: str, license: str, settings: WatchesSettings
+    left: str,  # log of the left watch (SensorLog's CSV, WristMotion.csv), and of the right
+    right: str,
+    camera: str | Path,  # the head camera's trajectory, of any format that prepare trajectory reads
+    splits: Splits,
+    calibration: str | None = None,  # calibration.json; null: clocks, headings and mounts are taken as they are
+    subject: str = "wearer",
+    license: str = "the recording's own",
+    # of the wearer (m); null: from how high the head is carried, when it is captured
+    height: float | int | None = None,
+    up: str = AUTO,  # as in prepare trajectory, where the calibration does not cover the camera; also axes, time_unit …
+    axes: str = AUTO,
+    time_unit: str | None = None,
+    fps: float | int | None = None,
+    unit: str | float | int = AUTO,
+    T_head_device: Sequence[float | int] | None = None,
 ) -> list[Task]:
     """The one recording of two watches and a head camera; hashed by all files."""
+    path = TrajectorySettings(up, axes, time_unit, fps, unit, T_head_device, height)
+    settings = WatchesSettings(left, right, calibration, path)
     others = [*settings.logs().values(), *([Path(settings.calibration)] if settings.calibration else [])]
     files = [Path(camera), *others, *settings.camera.files()]
     if missing := [str(file) for file in files if not file.exists()]:

@@ -1,9 +1,9 @@
-"""`data_prep/` stays in step with `wearcap prepare`: a file or another source's, a row of its page, a split list where one is read."""
+"""`data_prep/` stays in step with its page: a row for each source, a split list where one is read, a text for each setting."""
 
-import re
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from data_prep.shared.engine import Splits
 from wearcap.cli.conf import compose, splits_dir
@@ -22,19 +22,16 @@ def test_the_page_tells_what_a_source_needs(source):
     assert all(cells)
     command = cells[4].split("`")[1].split()
     assert command[:3] == ["wearcap", "prepare", source]
-    compose("prepare", [f"prepare={source}", *command[3:]])
-    config = sources()[source].read_text(encoding="utf-8")
-    if "rework:" not in config:  # these keep the splits of the data set that they change
-        listed = re.search(r"^splits: (\S+)", config, re.MULTILINE)
-        name = listed[1] if listed else f"{source}.csv"
-        assert f"`{name}`" in cells[5]
-        assert Splits.read(splits_dir() / name).rows
+    config = compose("prepare", [f"prepare={source}", *command[3:]])
+    if "tasks" in config:  # a rework keeps the splits of the data set that it changes
+        assert f"`{config.splits}`" in cells[5]
+        assert Splits.read(splits_dir() / config.splits).rows
 
 
-def test_every_file_serves_a_source_and_every_list_has_one():
-    configs = {name: path.read_text(encoding="utf-8") for name, path in sources().items()}
-    used = {file for text in configs.values() for file in re.findall(r"_target_: data_prep\.(\w+)\.", text)}
-    files = {path.stem for path in DATA_PREP.glob("*.py")} - {"__init__", "one_object", "ui_prmd"}  # read by others
-    assert files <= used
-    assert all(f"data_prep.{name}." in configs[name] for name in files & configs.keys())
-    assert {path.stem for path in (DATA_PREP / "splits").glob("*.csv")} <= configs.keys()
+def test_every_list_has_a_source_and_every_setting_a_default_or_a_text():
+    assert {path.stem for path in (DATA_PREP / "splits").glob("*.csv")} <= sources().keys()
+    for source in sources():
+        config = compose("prepare", [f"prepare={source}"])
+        missing = {str(key) for key in config if OmegaConf.is_missing(config, key)}
+        shown = {row.strip().split("=")[0] for row in help_of("prepare", [source]).splitlines() if "=" in row}
+        assert missing - {"right"} <= shown, source

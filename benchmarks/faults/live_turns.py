@@ -2,7 +2,6 @@
 
     python -m benchmarks.faults.live_turns [DATASET ...] [--seconds 10]
     python -m benchmarks.faults.live_turns --headings [DATASET ...]
-    python -m benchmarks.faults.live_turns --palms [DATASET ...]
 
 People turn their head before the body, so that turns show an offset of clocks although there is none. Head and wrists of recorded motion, on one clock, are compared as the guided first minute of a live capture does
 (`wearcap.apps.live.clock_offset`), in windows a second apart in which both have turned to both sides. Prints one JSON line for
@@ -15,11 +14,6 @@ recording's sensors have, or where it has none those of `sensors.imu.ImuNoise`. 
 watches on arms whose forearm is hanging in the last two seconds of the first minute, and one for all others: numbers of watches,
 recordings and persons, quantiles (50, 75, 95, 100 %) of the error (degrees) of the heading that was found, and the median of
 each wrist with its sign. Recordings that end before the first minute does are left out.
-
-`--palms`: how the palms of people face who stand with hanging arms, from which `live.placement.PRONATED_DEG` comes: in windows
-of two seconds of the training recordings in which the pelvis hardly moves and a forearm hangs. Prints for each data set and
-wrist one JSON line: numbers of windows and persons, and over the persons the least, median and largest of their median angles
-(degrees) by which the palm faces backwards from the thigh.
 """
 
 import argparse
@@ -34,7 +28,6 @@ import numpy as np
 import torch
 
 from wearcap.apps.live.clock_offset import LEAST_OFFSET_S, offset_by_turning, turned
-from wearcap.apps.live.placement import PRONATED_DEG, hanging
 from wearcap.apps.live.setup import Setup
 from wearcap.apps.live.setup_estimation import HOLD_S, SetupEstimation
 from wearcap.apps.live.sources.replay import ReplaySource
@@ -50,8 +43,6 @@ from wearcap.systems.mocap_every.stream import MocapEverySession
 
 SPOT_M, HANGING = 1.0, 0.6
 """Largest distance (m) of the pelvis from its median, and least downward component of a hanging forearm."""
-STILL_M = 0.05
-"""Largest distance (m) of the pelvis of somebody who stands from its median."""
 ENOUGH = 0.99
 """Share of the turning; the first minute also waits until the wearer rests."""
 WORN = dict(zip(WRISTS, (rotation.exp(torch.tensor([0.0, 0.0, 1.45])), rotation.exp(torch.tensor([0.1, 0.0, 1.7])))))
@@ -188,54 +179,14 @@ def print_headings(datasets: list[str]) -> None:
             print(json.dumps(row), flush=True)
 
 
-# --- palms ----------------------------------------------------------------------------------------------------------
-
-
-def palms_deg(recording: Recording) -> Iterator[tuple[str, float]]:
-    """(wrist, angle by which its palm faces backwards) of each window in which the wearer stands with a hanging arm."""
-    motion = recording.motion
-    frames = 0 if motion is None else round(HOLD_S * motion.fps)
-    for first in range(0, 0 if motion is None else len(motion) - frames + 1, max(frames // 2, 1)):
-        assert motion is not None
-        part = motion.sliced(first, first + frames)
-        ground = part.joint("pelvis").t[:, :2]
-        if (ground - ground.median(0).values).norm(dim=-1).max().item() > STILL_M:
-            continue
-        yaw = rotation.yaw_of(rotation.mean_rotation(part.joint("pelvis").R)).item()
-        for wrist in WRISTS:
-            if hangs(part, wrist):
-                R_assumed_wrist = hanging(wrist, yaw) @ rotation.mean_rotation(part.joint(wrist).R).mT
-                assumed_more = math.degrees(rotation.yaw_of(R_assumed_wrist).item())
-                yield wrist, PRONATED_DEG + (assumed_more if wrist.startswith("left") else -assumed_more)
-
-
-def print_palms(datasets: list[str]) -> None:
-    """Print how the palms of people who stand with hanging arms face."""
-    for folder in datasets:
-        found: dict[str, dict[str, list[float]]] = {wrist: {} for wrist in WRISTS}
-        for recording in recordings(folder, "train"):
-            for wrist, angle_deg in palms_deg(recording):
-                found[wrist].setdefault(recording.subject or recording.name, []).append(angle_deg)
-        for wrist, people in found.items():
-            row = {"dataset": Path(folder).name, "wrist": wrist, "windows": sum(map(len, people.values()))}
-            row["persons"] = len(people)
-            if people:
-                medians = [float(np.median(angles)) for angles in people.values()]
-                row["backwards_deg"] = np.quantile(medians, [0, 0.5, 1]).round(1).tolist()
-            print(json.dumps(row), flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("datasets", nargs="*", metavar="DATASET", help="default: those of the figures in the docs")
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a window")
     parser.add_argument("--headings", action="store_true", help="of watches, in place of clocks")
-    parser.add_argument("--palms", action="store_true", help="of hanging arms, in place of clocks")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    if options.palms:
-        print_palms(options.datasets or ["datasets/cmu", "datasets/hdm05"])
-    elif options.headings:
+    if options.headings:
         print_headings(options.datasets or ["datasets/simulated", "datasets/cmu"])
     else:
         print_clocks(options.datasets or ["datasets/cmu"], options.seconds)

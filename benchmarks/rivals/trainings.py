@@ -24,9 +24,9 @@ from typing import Any, cast
 import torch
 from joblib import Parallel, cpu_count, delayed
 
+from benchmarks.rivals import compose
 from benchmarks.tables.tabling import RATE_FILE
 from wearcap.cli import train
-from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 

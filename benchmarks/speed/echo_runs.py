@@ -1,7 +1,6 @@
 """Streams and batches for benchmarks of ECHO: the shared checkpoint, and walks with boxes."""
 
 import numpy as np
-import torch
 
 from benchmarks.speed.figures import rate
 from benchmarks.speed.planted import swinging
@@ -9,11 +8,8 @@ from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.runtime.wearer import Wearer
 from wearcap.scene.objects import Environment
-from wearcap.systems.echo.observations import Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.queue import Conditioning
 from wearcap.systems.echo.stream import EchoStream
-from wearcap.tracking.head_path import head_path
 from wearsim.places.movables import make_movable
 
 FPS = 30.0
@@ -71,13 +67,3 @@ def frames_per_second(pipeline: Echo, frames: int, repeats: int) -> float:
     """Of a session whose window is full, everything included; the median of some runs of as many frames."""
     stream = Streamed(pipeline).fill()
     return rate(lambda: [stream.step() for _ in range(frames)], frames, repeats)
-
-
-def conditions_of(pipeline: Echo, items: int, duration_s: float) -> Conditioning:
-    """Conditions of several walks of a human alone, as one batch."""
-    reader, parts = pipeline.reader(), []
-    for seed in range(items):
-        recording = swinging(f"walk_{seed}", duration_s, seed, fps=FPS)
-        path = head_path(recording, pipeline.model.skeleton, pipeline.fps)
-        parts.append(batch_item_of(Scenario(recording), path, reader).conditioning)
-    return Conditioning(*(torch.cat(fields) for fields in zip(*parts)))

@@ -1,6 +1,6 @@
 """Bending ten minutes of path at 30 Hz to camera positions: our second-order solver against Adam, same energy.
 
-The energy is the paper's (thesis eq. 5.2, conf/bending/adam.yaml): camera positions, 7 cm off, at every frame; a
+The energy is the paper's (thesis eq. 5.2, benchmarks/rivals/conf/bending/adam.yaml): camera positions, 7 cm off, at every frame; a
 path whose heading drifts by 0.6°/√s. Adam runs at three learning rates, each for at most the paper's 1000
 iterations, and may stop within 0.1 % of our energy, which costs it less than to reach it. The rate that is there
 first counts; where none gets there, the time that the best one took so far, so that the ratio is a lower bound. The
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 
+from benchmarks.rivals import compose
 from benchmarks.speed.figures import figure
-from wearcap.cli.conf import compose
 from wearcap.systems.ireplica.trajectory import BendingProblem, BentPath, bend_adam, bending_problem
 from wearcap.systems.ireplica.trajectory_banded import bend_banded
 

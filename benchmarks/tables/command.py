@@ -29,19 +29,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from benchmarks.tables.result_pages import (
-    RESULTS,
-    ROOT,
-    SPEED,
-    Page,
-    about,
-    everything,
-    publish,
-    read_speed,
-    render,
-    results,
-    with_readme,
-)
+from benchmarks.tables import result_pages as pages
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 
@@ -69,7 +57,7 @@ def main(arguments: list[str]) -> None:
         print(f"written: {write_page(arguments[0])}")
         return
     if "--all" in arguments:
-        print(everything(arguments[0], page_of(arguments[0]), read_speed()), end="")
+        print(pages.everything(arguments[0], page_of(arguments[0]), pages.read_speed()), end="")
         return
     system = importlib.import_module(f"{__package__}.{arguments[0]}")
     parser = argparse.ArgumentParser(f"tables.py {arguments[0]}", description=system.__doc__)
@@ -84,32 +72,32 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments[1:])
     command = shlex.join(["python", "benchmarks/tables.py", *(word for word in arguments if word != "--publish")])
     try:
-        path = system.tables(options, about(command))
+        path = system.tables(options, pages.about(command))
     except WearcapError as error:
         sys.exit(f"error: {error}")
     print(f"written: {path}")
     if options.publish:
-        print(f"written: {publish(path, left=options.leave)}")
+        print(f"written: {pages.publish(path, left=options.leave)}")
         if hasattr(system, "page"):
             print(f"written: {write_page(arguments[0])}")
 
 
-def page_of(system: str, folder: Path = RESULTS) -> Page:
+def page_of(system: str, folder: Path = pages.RESULTS) -> pages.Page:
     """What the page of a system holds; leaves with a message where it has no page, or nothing is published."""
     make, trees = (
         getattr(importlib.import_module(f"{__package__}.{system}"), "page", None),
-        results(system, SYSTEMS, folder),
+        pages.results(system, SYSTEMS, folder),
     )
     if make is None or not trees:
         sys.exit(f"error: no page of {system!r}. Expected {folder / system}.json, from tables.py {system} --publish.")
-    return make(trees, read_speed(folder / SPEED))
+    return make(trees, pages.read_speed(folder / pages.SPEED))
 
 
 def write_page(system: str) -> Path:
     """docs/results/SYSTEM.md, and README's row where it has one; returns the page's path."""
     page = page_of(system)
-    write_text(RESULTS / f"{system}.md", render(system, page, read_speed()))
+    write_text(pages.RESULTS / f"{system}.md", pages.render(system, page, pages.read_speed()))
     if page.measured:
-        readme = ROOT / "README.md"
-        write_text(readme, with_readme(readme.read_text(encoding="utf-8"), system, page))
-    return RESULTS / f"{system}.md"
+        readme = pages.ROOT / "README.md"
+        write_text(readme, pages.with_readme(readme.read_text(encoding="utf-8"), system, page))
+    return pages.RESULTS / f"{system}.md"

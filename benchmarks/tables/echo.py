@@ -18,41 +18,12 @@ from rich.progress import Progress
 
 from benchmarks.rivals.echo_baselines import NearestEcho, RigidWrist
 from benchmarks.rivals.echo_paper import PAPER, PAPER_HUMAN
-from benchmarks.tables import echo_limits
+from benchmarks.tables import echo_limits, tabling
+from benchmarks.tables import result_pages as pages
 from benchmarks.tables.echo_limits import EQUAL
 from benchmarks.tables.echo_rows import Captured, Method, captured, pipeline_of, scenario_of
-from benchmarks.tables.result_pages import (
-    Grid,
-    Page,
-    Tree,
-    Trees,
-    commands,
-    figures_of,
-    machines,
-    mean,
-    picked,
-    ranged,
-    ranked,
-    rows_of,
-    score_grids,
-    times,
-)
 from benchmarks.tables.sensed import GIVEN, WRONG_HEIGHTS
-from benchmarks.tables.tabling import (
-    TRAINING,
-    UPSIDE_DOWN,
-    add_people,
-    budget,
-    left_out,
-    plain,
-    recordings_of,
-    split_of,
-    titled,
-    training_of,
-    trainings_of,
-    upright,
-    write_tree,
-)
+from benchmarks.tables.tabling import plain
 from wearcap.cli.conf import compose
 from wearcap.metrics.table import TRUTH, Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.recording import RecordingStore
@@ -91,7 +62,7 @@ LABELS = {
     "training_minutes": ("minutes learned from", 0),
 }
 """Columns of the tables of objects."""
-BODY, OBJECTS = ({name: heading for name, (heading, _) in of.items()} | TRAINING for of in (OF_BODIES, LABELS))
+BODY, OBJECTS = ({name: heading for name, (heading, _) in of.items()} | tabling.TRAINING for of in (OF_BODIES, LABELS))
 """Their headings, of people alone and with objects."""
 ANYWHERE = ("pipeline=echo", "pipeline.freedoms=false")
 """Like the rivals, which know no hinges, rails or floor that an object keeps to."""
@@ -222,7 +193,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=list(PARTS),
         help="tables to make",
     )
-    add_people(parser)
+    tabling.add_people(parser)
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -237,13 +208,13 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
             scores = scores | {"truth": truth_row(ours)}
             found[title] = plain(scores)
             console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
-            write_tree(path, {"about": about, "tables": found})
+            tabling.write_tree(path, {"about": about, "tables": found})
     return path
 
 
 def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """Table 1: ours beside what it must beat."""
-    store, names = recordings_of(options, "simulated_objects")
+    store, names = tabling.recordings_of(options, "simulated_objects")
     ours = Method("ours", options.checkpoint, measured=True)
     scores: Scores = {}
     data = instantiate(
@@ -259,7 +230,7 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapp
     for one in _captured(ours, options, progress, store, names):
         mine.append(score_echo(one.motion, one.truth, one.name, one.seed))
         stuck.append(score_echo(wrist.attached(one.motion, one.item), one.truth, one.name, one.seed))
-    took = training_of(options.checkpoint)
+    took = tabling.training_of(options.checkpoint)
     scores |= {"ours, object stuck to the nearer wrist": aggregate(stuck), "ours": aggregate(mine) | took}
     more = [
         Method("ours, environment exact", options.checkpoint),
@@ -276,7 +247,7 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapp
 
 def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """How frames are denoised; defaults are chosen by this table, on the validation split."""
-    store, names = recordings_of(options, "simulated_objects")
+    store, names = tabling.recordings_of(options, "simulated_objects")
     chosen = {name: changes for name, changes in SETTINGS.items() if name not in options.leave}
     methods = [Method(name, options.checkpoint, changes) for name, changes in chosen.items()]
     return f"Settings: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
@@ -284,14 +255,14 @@ def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, Map
 
 def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """Table 4: networks that were trained alike, but for one choice."""
-    store, names = recordings_of(options, "simulated_objects")
+    store, names = tabling.recordings_of(options, "simulated_objects")
     methods = _trained(ABLATIONS, options, progress)
     return f"Ablation: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
 
 def _rivals(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """Rows of Table 1 beside ours, all trained within one budget."""
-    store, names = recordings_of(options, "simulated_objects")
+    store, names = tabling.recordings_of(options, "simulated_objects")
     methods = _trained(RIVALS, options, progress)
     return f"{EQUAL}: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
@@ -302,11 +273,11 @@ def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, prog
     for name, (run, *pipeline) in rows.items():
         if name in options.leave:
             continue
-        if paths := trainings_of(options.runs, run):
+        if paths := tabling.trainings_of(options.runs, run):
             methods.append(Method(name, str(paths[0]), tuple(pipeline), others=tuple(map(str, paths[1:]))))
         else:
             path = options.runs / run / "checkpoints" / "best.ckpt"
-            progress.console.print(left_out(name, "echo", run, path), markup=False, soft_wrap=True)
+            progress.console.print(tabling.left_out(name, "echo", run, path), markup=False, soft_wrap=True)
     return methods
 
 
@@ -314,12 +285,12 @@ def training(run: str, frames: int = BUDGET, batch: int | None = None) -> list[s
     """Overrides that train one of `RUNS` within a budget, in batches of as many frames as BATCH windows of ours have."""
     windows, length = LONG if run == "agrol_human" else BATCH
     windows = round(batch * windows / BATCH[0]) if batch else windows
-    return [*TRAININGS[run], f"data.loading.batch_size={windows}", *budget(frames, windows * length)]
+    return [*TRAININGS[run], f"data.loading.batch_size={windows}", *tabling.budget(frames, windows * length)]
 
 
 def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """Tables 3 and S2: a share of one modality's frames is given."""
-    store, names = recordings_of(options, "simulated_objects")
+    store, names = tabling.recordings_of(options, "simulated_objects")
     rows = [None, *((modality, share) for modality, shares in SHARES.items() for share in shares)]
     methods = [Method(_given(row), options.checkpoint, UNGUIDED, row) for row in rows]
     for label, changes in (("guided", ANYWHERE), ("guided, hinges and rails known", ("pipeline=echo",))):
@@ -334,15 +305,15 @@ def _given(row: tuple[str, float] | None) -> str:
 
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """Table 2: people without objects."""
-    scores = _people(options, progress, *recordings_of(options, "cmu"))
-    title = titled(f"Table 2: CMU, {options.split}; {TRUTH_GIVEN}", options)
+    scores = _people(options, progress, *tabling.recordings_of(options, "cmu"))
+    title = tabling.titled(f"Table 2: CMU, {options.split}; {TRUTH_GIVEN}", options)
     return title, BODY, scores | ({} if options.keep else PAPER_HUMAN)
 
 
 def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """The same rows on people of another laboratory."""
-    scores = _people(options, progress, *split_of(options, root))
-    return titled(f"People ({root.name}): {options.split}; {TRUTH_GIVEN}", options), BODY, scores
+    scores = _people(options, progress, *tabling.split_of(options, root))
+    return tabling.titled(f"People ({root.name}): {options.split}; {TRUTH_GIVEN}", options), BODY, scores
 
 
 def _people(options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]) -> Scores:
@@ -366,8 +337,8 @@ def _scores(
             score_echo(one.motion, one.truth, one.name, one.seed)
             for one in _captured(method, options, progress, store, names)
         ]
-        scores[method.name] = aggregate(made) | training_of(method.checkpoint, *method.others)
-        scores |= upright(method.name, made) if method.name == "ours" else {}
+        scores[method.name] = aggregate(made) | tabling.training_of(method.checkpoint, *method.others)
+        scores |= tabling.upright(method.name, made) if method.name == "ours" else {}
         shown = (f"{key} {scores[method.name][key]}" for key in OBJECTS if key in scores[method.name])
         progress.console.print(f"{method.name}: {', '.join(shown)}", soft_wrap=True)
     return scores
@@ -379,7 +350,7 @@ def _captured(
     """With all seeds; of several trainings, each with a seed of its own. Wrists that are tracked beside a head that is
     `UPSIDE_DOWN` would be refused as swapped."""
     if method.sensors != GIVEN:
-        names = [name for name in names if name not in UPSIDE_DOWN]
+        names = [name for name in names if name not in tabling.UPSIDE_DOWN]
     changed = replace(method, pipeline=(*method.pipeline, *options.pipeline), others=())
     runs = [(changed, list(range(2 if options.quick else options.seeds)))]
     if method.others:
@@ -445,11 +416,11 @@ CLOCKS = {
 """Benchmarks: what is measured, what is given, and what it is held against."""
 
 
-def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
+def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
     """What docs/results/echo.md says."""
-    objects, people = rows_of(trees, OBJECTS_1), rows_of(trees, CMU)
-    online = figures_of(speed, "echo_online_small_fps")
-    placed, unknown = (mean(objects[row]["center_cm"], 0) for row in ("ours", "ours, hinges and rails unknown"))
+    objects, people = pages.rows_of(trees, OBJECTS_1), pages.rows_of(trees, CMU)
+    online = pages.figures_of(speed, "echo_online_small_fps")
+    placed, unknown = (pages.mean(objects[row]["center_cm"], 0) for row in ("ours", "ours, hinges and rails unknown"))
     joints, *tracked = (
         {"mean": rows[row]["mpjpe_mm"]["mean"] / 10}
         for rows, row in (
@@ -457,14 +428,14 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             *((people, f"ours{tracking}") for tracking in ("", ", typical tracking", ", poor tracking")),
         )
     )
-    return Page(
+    return pages.Page(
         title="[ECHO](../echo.md): figures",
-        headline=Grid(
+        headline=pages.Grid(
             "Whole recordings, bodies and objects measured where they stand in the world: simulated people with objects, CMU's people "
             "and a person of another laboratory (HDM05) without. Means over seeds of the noise, ± their deviation. Rivals and ours of "
             "their budget learned alike; all are captured as means.",
             ("", *(name for name, _, _ in COMPARED)),
-            picked(trees, HEADLINE, COMPARED),
+            pages.picked(trees, HEADLINE, COMPARED),
         ),
         held_out="People and object instances of the test split, four CMU subjects and one person of HDM05; kinds of objects are known "
         "from training. Settings were chosen on the validation split.",
@@ -473,16 +444,16 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "body have the errors of devices, nobody has measured the floor, and 127_32 is left out. Sizes of errors are in "
         "[simulation](simulation.md).",
         limits=echo_limits.limits(trees, OBJECTS_1, CMU, HDM05),
-        full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS)],
-        commands=commands(trees),
-        measured=f"joints {ranged([joints])} cm and objects {placed} cm off, exactly tracked ({unknown} with unknown hinges); real motion (CMU) "
-        f"{ranged(tracked)}, with exact to poor tracking",
-        speed=f"{times(online)} online, head and wrists tracked, active object given ({machines(online)})"
+        full=[grid for tree in trees.values() for grid in pages.score_grids(tree, LABELS)],
+        commands=pages.commands(trees),
+        measured=f"joints {pages.ranged([joints])} cm and objects {placed} cm off, exactly tracked ({unknown} with unknown hinges); real motion (CMU) "
+        f"{pages.ranged(tracked)}, with exact to poor tracking",
+        speed=f"{pages.times(online)} online, head and wrists tracked, active object given ({pages.machines(online)})"
         if online
         else "",
         clocks=CLOCKS,
         pictures=(
-            *ranked("echo"),
+            *pages.ranked("echo"),
             ("echo_box.png", "A box that is carried, truth above and captured below, points that touch lit"),
             ("echo_table.png", "A table that is pushed: the span of median error"),
             ("echo_suitcase.png", "A suitcase that is carried: the span of median error"),

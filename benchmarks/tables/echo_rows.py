@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.rivals import compose
 from benchmarks.tables.sensed import GIVEN, sensed
-from wearcap.cli.conf import compose, load_pipeline
+from wearcap.cli.conf import load_pipeline
 from wearcap.errors import require_choice
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion, RecordingStore

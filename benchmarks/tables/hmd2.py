@@ -14,42 +14,16 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.rivals.hmd2_paper import PAPER, PAPER_METRICS, PAPER_TAIL, paper_rows
+from benchmarks.tables import result_pages as pages
+from benchmarks.tables import tabling
 from benchmarks.tables.hmd2_runs import BASELINES, Case, Method, Result, run_method
-from benchmarks.tables.result_pages import (
-    Grid,
-    Page,
-    Tree,
-    Trees,
-    commands,
-    figures_of,
-    grid_of,
-    machines,
-    mean,
-    ranged,
-    ranked,
-    score_grids,
-    text,
-    times,
-)
 from benchmarks.tables.sensed import GIVEN, WRONG_HEIGHTS, add_sensors
-from benchmarks.tables.tabling import (
-    TRAINING,
-    add_people,
-    budget,
-    is_trained,
-    left_out,
-    plain,
-    split_of,
-    titled,
-    trainings_of,
-    write_tree,
-)
-from benchmarks.tables.wearables import WEARABLES
 from wearcap.errors import WearcapError
 from wearcap.evaluation.breakdown import extremes
 from wearcap.metrics.table import P95, Scores, Summary, rich_lines, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
+from wearsim.sensors.wearables import WEARABLES
 
 COLUMNS = {
     "mpjpe_cm": "MPJPE",
@@ -68,7 +42,7 @@ COLUMNS = {
     "jitter_ratio": "jitter",
     "seam_ratio": "seam",
     "world_mpjpe_cm": "world",
-    **TRAINING,
+    **tabling.TRAINING,
 }
 """Columns of the first table; "jitter" is of the truth's, "world" the MPJPE that is not anchored to the true head."""
 PARTS = {
@@ -168,7 +142,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, nargs="*", default=STEPS, help="steps of Table 6.7")
     parser.add_argument("--device", default="cpu", help="device that captures")
     parser.add_argument("--jobs", type=int, default=2, help="rows at a time")
-    add_people(parser)
+    tabling.add_people(parser)
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -214,10 +188,10 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     tree = {
         "about": facts,
         "tables": {title: [_short(asdict(result)) for result in rows] for title, rows in found.items()},
-        "percentiles": plain(tail),
-        "scenarios": {title: plain(rows) for title, rows in scenarios.items()},
+        "percentiles": tabling.plain(tail),
+        "scenarios": {title: tabling.plain(rows) for title, rows in scenarios.items()},
     }
-    return write_tree(path, tree)
+    return tabling.write_tree(path, tree)
 
 
 def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -236,21 +210,21 @@ def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
     methods = ours if options.keep else [*there.values(), *ours]
     methods = [method for method in methods if method.name not in options.leave]
     for root in options.strangers:
-        store, names = split_of(options, root)
+        store, names = tabling.split_of(options, root)
         seeds = tuple(range(2 if options.quick else options.seeds))
         case = Case(store.root, tuple(names), seeds, tuple(options.training), None, options.sensors, options.device)
         results = Parallel(n_jobs=options.jobs)(delayed(run_method)(method, case) for method in methods)
-        title = titled(f"People ({root.name}): {options.split}, head alone, {options.sensors} sensors", options)
+        title = tabling.titled(f"People ({root.name}): {options.split}, head alone, {options.sensors} sensors", options)
         found = [result for result in results if result is not None]
         console.print(_table(title, found))
         scores = {result.method: result.scores for result in found}
-        tables[title] = plain(scores | {"truth": truth_row(scores[ours[0].name])})
+        tables[title] = tabling.plain(scores | {"truth": truth_row(scores[ours[0].name])})
         facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
-        write_tree(path, {"about": facts, "tables": tables})
+        tabling.write_tree(path, {"about": facts, "tables": tables})
     return path
 
 
-def _short(result: Tree) -> Tree:
+def _short(result: pages.Tree) -> pages.Tree:
     """A result as JSON: by activity, what is shown alone."""
     activities = {
         name: {metric: scores[metric] for metric in PARTS if metric in scores}
@@ -300,7 +274,7 @@ def _case(options: argparse.Namespace) -> Case:
 
 def _exists(checkpoint: str) -> bool:
     try:
-        return is_trained(checkpoint_file(checkpoint))
+        return tabling.is_trained(checkpoint_file(checkpoint))
     except WearcapError:
         return False
 
@@ -327,14 +301,14 @@ def training(run: str, frames: int = BUDGET, batch: int | None = None) -> list[s
     batch = batch or BATCH
     experiment = run if run == "motion_diffusion_head" else f"baseline/{run}"
     data = [f"experiment={experiment}", "data=hmd2_head", f"data.loading.batch_size={batch}", "callbacks=averaged"]
-    return [*data, *budget(frames, batch * WINDOW.get(run, 240))]
+    return [*data, *tabling.budget(frames, batch * WINDOW.get(run, 240))]
 
 
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     """Rows of the first table; those whose checkpoint is not there are named and left out."""
     trained = []
     for name, (run, pipeline, sensors) in TRAINED.items():
-        first, *others = trainings_of(options.runs, run) or [options.runs / run / "checkpoints" / "best.ckpt"]
+        first, *others = tabling.trainings_of(options.runs, run) or [options.runs / run / "checkpoints" / "best.ckpt"]
         trained.append(Method(name, str(first), pipeline, sensors, others=tuple(map(str, others))))
     full = _ours(options, OURS)
     sensing = [replace(full, name=f"full, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
@@ -358,7 +332,7 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
         if method not in there:
             run = TRAINED.get(method.name, ("",))[0]
             line = f"left out: {method.name} (no checkpoint {method.checkpoint!r})"
-            line = left_out(method.name, "hmd2", run, method.checkpoint) if run else line
+            line = tabling.left_out(method.name, "hmd2", run, method.checkpoint) if run else line
             console.print(line, markup=False, soft_wrap=True)
     return there
 
@@ -406,25 +380,25 @@ CLOCKS = {
 """Benchmarks: what is measured, what is given, and what it is held against."""
 
 
-def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
+def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
     """What docs/results/hmd2.md says."""
-    found, people = commands(trees), trees.get("hmd2_people", {"tables": {}})
+    found, people = pages.commands(trees), trees.get("hmd2_people", {"tables": {}})
     trees = {name: tree for name, tree in trees.items() if name != "hmd2_people"}
     simulated, real = (
         {row["method"]: row["scores"] for row in _rows(trees, name)} for name in ("simulated_camera", "cmu_surrounded")
     )
     strangers = next((rows for title, rows in people["tables"].items() if title.startswith("People (hdm05)")), {})
     shown = (("CMU", real), ("HDM05", strangers), ("simulated", simulated))
-    online = figures_of(speed, "hmd2_online_small_fps")
-    return Page(
+    online = pages.figures_of(speed, "hmd2_online_small_fps")
+    return pages.Page(
         title="[HMD²](../hmd2.md): figures",
-        headline=Grid(
+        headline=pages.Grid(
             "Whole recordings, anchored to the true head; means over repetitions, ± their deviation (cm); jitter as a multiple of "
             "the truth's. CMU has points and pictures of simulated surroundings; HDM05's person, of another laboratory, has none, "
             "and only the head is seen. “Its mean”: one step of the rival's diffusion, as ours.",
             ("", *(f"{what}: {METRICS[metric]}" for what, metric in COMPARED)),
             [
-                [label, *(text(dict(shown)[what].get(name, {}).get(metric)) for what, metric in COMPARED)]
+                [label, *(pages.text(dict(shown)[what].get(name, {}).get(metric)) for what, metric in COMPARED)]
                 for name, label in HEADLINE.items()
                 if any(name in rows for _, rows in shown)
             ],
@@ -436,13 +410,15 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "and pictures are simulated. The head's path has the jitter of [simulation](simulation.md). Rows without other words have "
         "typical sensors.",
         limits=_limits(simulated, real, strangers),
-        full=[*score_grids(people, _labels(), "repetitions"), *_grids(trees)],
+        full=[*pages.score_grids(people, _labels(), "repetitions"), *_grids(trees)],
         commands=found,
         measured=_measured(simulated, real),
-        speed=f"{times(online)} online, head's path and points given ({machines(online)})" if online else "",
+        speed=f"{pages.times(online)} online, head's path and points given ({pages.machines(online)})"
+        if online
+        else "",
         clocks=CLOCKS,
         pictures=(
-            *ranked("hmd2"),
+            *pages.ranked("hmd2"),
             ("hmd2_samples.png", "One input, several motions (four samples, above them the truth)"),
         ),
     )
@@ -465,21 +441,23 @@ COMPARED = (
 """Columns of the page's table."""
 
 
-def _measured(simulated: dict[str, Tree], real: dict[str, Tree]) -> str:
+def _measured(simulated: dict[str, pages.Tree], real: dict[str, pages.Tree]) -> str:
     """README's cell: ranges over sensors, beside the lookup of the nearest window."""
-    errors = [ranged(rows[name]["mpjpe_cm"] for name in SENSING if name in rows) for rows in (simulated, real)]
-    looked_up = [mean(rows["nearest window"]["mpjpe_cm"]) for rows in (simulated, real)]
+    errors = [pages.ranged(rows[name]["mpjpe_cm"] for name in SENSING if name in rows) for rows in (simulated, real)]
+    looked_up = [pages.mean(rows["nearest window"]["mpjpe_cm"]) for rows in (simulated, real)]
     return (
         f"joints {errors[0]} cm off (the nearest training window: {looked_up[0]}); real motion (CMU) {errors[1]} ({looked_up[1]}); both with "
         "ideal to poor sensors"
     )
 
 
-def _limits(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[str, Tree]) -> tuple[str, ...]:
+def _limits(
+    simulated: dict[str, pages.Tree], real: dict[str, pages.Tree], strangers: dict[str, pages.Tree]
+) -> tuple[str, ...]:
     """The weak sides, with their figures."""
 
-    def error(rows: dict[str, Tree], name: str, metric: str = "mpjpe_cm", digits: int = 1) -> str:
-        return mean(rows.get(name, {}).get(metric), digits)
+    def error(rows: dict[str, pages.Tree], name: str, metric: str = "mpjpe_cm", digits: int = 1) -> str:
+        return pages.mean(rows.get(name, {}).get(metric), digits)
 
     fid, paper = PAPER_METRICS.index("fid"), PAPER["HMD² (h = 180)"]
     ours, rival, hands = BRIEF, "EgoEgo-style, its mean", "AvatarPoser-style (head and hands)"
@@ -508,16 +486,16 @@ def _limits(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[s
     )
 
 
-def _frames(rows: dict[str, Tree]) -> str:
+def _frames(rows: dict[str, pages.Tree]) -> str:
     """Million frames that rivals which see the head alone, and ours beside them, saw."""
     seen = [rows[row]["frames_seen_m"] for row, (_, _, sensors) in TRAINED.items() if sensors is None and row in rows]
-    return ranged(seen)
+    return pages.ranged(seen)
 
 
-def _grids(trees: Trees) -> list[Grid]:
+def _grids(trees: pages.Trees) -> list[pages.Grid]:
     """All tables."""
     grids = [
-        grid_of(
+        pages.grid_of(
             _table(
                 f"{title} ({name.removeprefix('hmd2_')}{', validation' * (title != FIRST)})", [*map(Result.of, rows)]
             ),
@@ -531,14 +509,14 @@ def _grids(trees: Trees) -> list[Grid]:
     for tree in trees.values():
         parts = {"Table 6.6: 95th percentiles": tree.get("percentiles"), **tree.get("scenarios", {})}
         found = {title: rows for title, rows in parts.items() if rows}
-        grids += score_grids({"about": tree["about"], "tables": found}, _labels())
+        grids += pages.score_grids({"about": tree["about"], "tables": found}, _labels())
     first = {name: [Result.of(row) for row in tree["tables"].get(FIRST, [])] for name, tree in trees.items()}
     for name, rows in first.items():
         if max((len(row.activities) for row in rows), default=0) > 4:  # of fewer, Tables 6.8 to 6.10 show enough
             table = _activities(
                 f"Tables 6.8–6.10: MPJPE (cm) by what was mostly done ({name.removeprefix('hmd2_')})", rows, "mpjpe_cm"
             )
-            grids.append(grid_of(table, trees[name]["about"]))
+            grids.append(pages.grid_of(table, trees[name]["about"]))
     return grids
 
 
@@ -547,10 +525,10 @@ def _labels() -> dict[str, tuple[str, int]]:
     return {name: (title, 2) for name, title in COLUMNS.items()}
 
 
-def _rows(trees: Trees, name: str) -> list[Tree]:
+def _rows(trees: pages.Trees, name: str) -> list[pages.Tree]:
     return trees.get(f"hmd2_{name}", {}).get("tables", {}).get(FIRST, [])
 
 
-def _repetitions(rows: list[Tree]) -> str:
+def _repetitions(rows: list[pages.Tree]) -> str:
     count = max((score["seeds"] for row in rows for score in row["scores"].values()), default=1)
     return f"{count} repetitions" if count > 1 else ""

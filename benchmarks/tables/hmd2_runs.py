@@ -5,10 +5,11 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.rivals import compose
 from benchmarks.tables.result_pages import Tree, summaries
 from benchmarks.tables.sensed import SensedStore
 from benchmarks.tables.tabling import training_of
-from wearcap.cli.conf import compose, load_pipeline
+from wearcap.cli.conf import load_pipeline
 from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.breakdown import by_activity
 from wearcap.evaluation.evaluate import Realism, evaluate

@@ -14,22 +14,9 @@ from joblib import Parallel, delayed
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.tables import result_pages as pages
 from benchmarks.tables.hps_runs import DISTURBED, PRINTED, ROWS, TRUTH, SeedRun, run_seed
 from benchmarks.tables.hps_sessions import SessionSettings
-from benchmarks.tables.result_pages import (
-    NONE,
-    Grid,
-    Page,
-    Tree,
-    Trees,
-    commands,
-    figures_of,
-    grid_of,
-    machines,
-    mean,
-    ranged,
-    text,
-)
 from benchmarks.tables.tabling import cell, new_table, summarize, write_tree
 from wearsim.recordings.hps import HpsConfig, Protocol
 from wearsim.recordings.localization_noise import LocalizationNoise
@@ -134,15 +121,15 @@ HEADLINE = (
 """Rows of the page's first table: file, row, and what the page calls it."""
 
 
-def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
+def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
     """What docs/results/hps.md says."""
     typical = trees["hps"]
     whole = {row: [tree["whole"][row]["mpjpe_cm"] for tree in trees.values()] for row in ("IMU", "HPS", "ours")}
     end = typical["places"][-1]
     columns = ("joints", "95 % below", f"standing, {end}", f"moving, {end}", "feet to scan", "sliding a frame")
-    return Page(
+    return pages.Page(
         title="[HPS](../hps.md): figures",
-        headline=Grid(
+        headline=pages.Grid(
             f"Joints over whole sessions, where they stand in the world, and the Chamfer distance to depth cameras' clouds after {end}; means over "
             "sessions, ± their deviation (cm); jitter as a multiple of the truth's.",
             ("", *columns, "jitter"),
@@ -162,24 +149,24 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "is from its own recordings: no comparison, but for the order of its rows.",
         limits=_limits(typical),
         full=[grid for tree in trees.values() for grid in _grids(tree)],
-        commands=commands(trees),
-        measured=f"joints {ranged(whole['ours'])} cm off over {end} and more, {_presets(trees)} (the authors' code "
-        f"{ranged(whole['HPS'])}; suit alone: {ranged(whole['IMU'], 0)})",
+        commands=pages.commands(trees),
+        measured=f"joints {pages.ranged(whole['ours'])} cm off over {end} and more, {_presets(trees)} (the authors' code "
+        f"{pages.ranged(whole['HPS'])}; suit alone: {pages.ranged(whole['IMU'], 0)})",
         speed=_speed(typical, speed),
         clocks=CLOCKS,
     )
 
 
-def _speed(tree: Tree, speed: dict[str, list[Tree]]) -> str:
+def _speed(tree: pages.Tree, speed: dict[str, list[pages.Tree]]) -> str:
     """README's cell."""
     seconds = sum(stage["mean"] for stage in tree["stage_seconds"].get("ours", {}).values())
     if not seconds:
         return ""
-    figures = figures_of(speed, "hps_end_to_end_realtime")
-    values = ranged({"mean": figure["value"]} for figure in figures)
+    figures = pages.figures_of(speed, "hps_end_to_end_realtime")
+    values = pages.ranged({"mean": figure["value"]} for figure in figures)
     whole = f", {values} × with localisation" if figures else ""
     given = f"{tree['frames']['mean'] / 30 / seconds:.0f} × real time, localised cameras given"
-    return f"{given}{whole} ({machines([tree['about'], *figures])})"
+    return f"{given}{whole} ({pages.machines([tree['about'], *figures])})"
 
 
 CLOCKS = {
@@ -195,48 +182,48 @@ CLOCKS = {
 """Benchmarks: what is measured, what is given, and what it is held against."""
 
 
-def _presets(trees: Trees) -> str:
+def _presets(trees: pages.Trees) -> str:
     names = [name for name in SUITS if name in {tree["sensors"] for tree in trees.values()}]
     return f"with {names[0]} sensors" if len(names) == 1 else f"with {names[0]} to {names[-1]} sensors"
 
 
-def _grids(tree: Tree) -> list[Grid]:
+def _grids(tree: pages.Tree) -> list[pages.Grid]:
     """All tables of a preset."""
     sessions = tree["whole"]["ours"]["mpjpe_cm"]["seeds"]
     spread = f"{sessions} sessions" if sessions > 1 else "one session"
-    grids = [grid_of(table, tree["about"], spread) for table in _all_tables(tree)]
+    grids = [pages.grid_of(table, tree["about"], spread) for table in _all_tables(tree)]
     return [replace(grid, title=f"{tree['sensors']} sensors: {grid.title}") for grid in grids]
 
 
-def _headline(tree: Tree, row: str) -> list[str]:
+def _headline(tree: pages.Tree, row: str) -> list[str]:
     whole, feet = tree["whole"][row], tree["feet"][row]
     places = (tree["chamfer_cm"][name][row][-1] for name in ("stand", "move"))
-    cells = [text(whole["mpjpe_cm"], 1), mean(whole["p95_cm"]), *(text(place, 1) for place in places)]
+    cells = [pages.text(whole["mpjpe_cm"], 1), pages.mean(whole["p95_cm"]), *(pages.text(place, 1) for place in places)]
     return [
         *cells,
-        *(mean(feet[name], 2) for name in ("absolute_distance_cm", "sliding_cm")),
-        mean(whole["jitter_ratio"]),
+        *(pages.mean(feet[name], 2) for name in ("absolute_distance_cm", "sliding_cm")),
+        pages.mean(whole["jitter_ratio"]),
     ]
 
 
 def _paper_headline() -> list[str]:
     feet = [f"{value:g}" for value in PAPER_FEET["HPS"]]
     after = [f"{PAPER[name]['HPS'][-1]:.1f}" for name in ("stand", "move")]
-    return ["the paper's HPS, on its own recordings", NONE, NONE, *after, *feet, NONE]
+    return ["the paper's HPS, on its own recordings", pages.NONE, pages.NONE, *after, *feet, pages.NONE]
 
 
-def _limits(tree: Tree) -> tuple[str, ...]:
+def _limits(tree: pages.Tree) -> tuple[str, ...]:
     """The weak sides, with their figures."""
     lost = [
-        f"for {where.removeprefix('within ')} the root is {mean(part['root_cm'])} cm off meanwhile, "
-        f"{mean(part['root_ratio'])} times as far as without (the authors' code "
-        f"{mean(tree['outages']['HPS'][where]['root_cm'], 0)} cm)"
+        f"for {where.removeprefix('within ')} the root is {pages.mean(part['root_cm'])} cm off meanwhile, "
+        f"{pages.mean(part['root_ratio'])} times as far as without (the authors' code "
+        f"{pages.mean(tree['outages']['HPS'][where]['root_cm'], 0)} cm)"
         for where, part in tree["outages"]["ours"].items()
         if where.startswith("within")
     ]
     order = [sum(held) for held in tree["order_beyond_start"]["HPS"].values()]
     count = len(tree["order_beyond_start"]["HPS"]["stand"])
-    least = " and ".join(mean(tree["chamfer_cm"][name][TRUTH][-1]) for name in TITLES)
+    least = " and ".join(pages.mean(tree["chamfer_cm"][name][TRUTH][-1]) for name in TITLES)
     return (
         f"When localisation is lost in mid-walk {'; '.join(lost)}.",
         "A session's heading is one draw of a random walk: the IMU row spreads widely over few sessions.",

@@ -10,25 +10,25 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 
+from benchmarks.rivals import compose
 from benchmarks.rivals.foot_surface import FootSurface
 from benchmarks.rivals.hps_scores import HpsScores, HpsTruth, score_hps
 from benchmarks.tables.hps_outages import Outage, disturbance, planted_outages, with_outage
 from benchmarks.tables.hps_sessions import Session, SessionSettings, TrueClock, load_session
-from wearcap.cli.conf import compose
 from wearcap.recording import Motion
 from wearcap.runtime.stages import run_stages
 from wearcap.runtime.system import CaptureInput
 
 ROWS = {
-    "IMU": "baseline/hps_imu",
-    "IMU + Cam": "baseline/hps_imu_cam",
-    "IMU + Cam (filtered)": "baseline/hps_imu_cam_filtered",
-    "HPS w/o scene": "paper/hps_without_scene",
-    "HPS": "paper/hps_released",
-    "ours": "hps",
+    "IMU": ("baseline/hps_suit", "pipeline.kind=imu"),
+    "IMU + Cam": ("baseline/hps_suit", "pipeline.kind=imu_cam"),
+    "IMU + Cam (filtered)": ("baseline/hps_suit", "pipeline.kind=imu_cam_filtered"),
+    "HPS w/o scene": ("paper/hps_without_scene",),
+    "HPS": ("paper/hps_released",),
+    "ours": ("hps",),
 }
-"""The papers' rows, as the authors' code computes them, and ours: names of pipeline configs."""
-PRINTED = {"HPS as printed": "paper/hps"}
+"""The papers' rows, as the authors' code computes them, and ours: names of pipeline configs, with overrides."""
+PRINTED = {"HPS as printed": ("paper/hps",)}
 """The paper's own energy and solver, which take an hour a session."""
 DISTURBED = ("IMU + Cam (filtered)", "HPS", "ours")
 OUTAGES_S = (30.0, 60.0)
@@ -44,7 +44,7 @@ class SeedRun:
     seed: int
     cache: Path
     solver_jobs: int
-    rows: dict[str, str]
+    rows: dict[str, tuple[str, ...]]
     """Rows and their pipelines."""
 
 
@@ -99,11 +99,12 @@ class Teller:
         print(f"[{self.who}, {time.perf_counter() - self.begin:4.0f} s] {line}", file=sys.stderr, flush=True)
 
 
-def _captured(session: Session, pipeline: str, run: SeedRun) -> tuple[Motion, dict[str, float], float]:
+def _captured(session: Session, pipeline: tuple[str, ...], run: SeedRun) -> tuple[Motion, dict[str, float], float]:
     """The motion, seconds per stage, and the largest error of the clock that was found (s)."""
     clock = TrueClock.of(session.recording)
     overrides = [
-        f"pipeline={pipeline}",
+        f"pipeline={pipeline[0]}",
+        *pipeline[1:],
         "checkpoint=null",
         "recording=null",
         f"pipeline.synchronization.camera_claps_s={clock.heard_s(session.recording, run.seed)}",

@@ -16,47 +16,17 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
+from benchmarks.tables import result_pages as pages
+from benchmarks.tables import tabling
 from benchmarks.tables.mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
 from benchmarks.tables.mocap_every_several import VIEW_DEG, Watched, session_rows, watched_pair, watched_person
-from benchmarks.tables.result_pages import (
-    Grid,
-    Page,
-    Tree,
-    Trees,
-    commands,
-    figures_of,
-    machines,
-    mean,
-    picked,
-    ranged,
-    ranked,
-    rows_of,
-    score_grids,
-    text,
-    times,
-    upside_down,
-)
 from benchmarks.tables.sensed import GIVEN, WRONG_HEIGHTS, add_sensors
-from benchmarks.tables.tabling import (
-    TRAINING,
-    add_people,
-    budget,
-    left_out,
-    plain,
-    recordings_of,
-    split_of,
-    titled,
-    training_of,
-    trainings_of,
-    upright,
-    write_tree,
-)
-from benchmarks.tables.wearables import WEARABLES
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
+from wearsim.sensors.wearables import WEARABLES
 
 BODY = (
     "r_mpjpe_cm",
@@ -72,7 +42,7 @@ BODY = (
     "jitter_m_s3",
     "physicality",
     "floor_penetration_cm",
-    *TRAINING,
+    *tabling.TRAINING,
 )
 FLOOR = (
     "upper_pe_cm",
@@ -168,13 +138,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=["body", "floor", "cues", "several"],
         help="tables to make; trainings, too, for those who have several, and totalcapture for those who have prepared it",
     )
-    add_people(parser)
+    tabling.add_people(parser)
 
 
 def training(run: str, frames: int = BUDGET, batch: int | None = None) -> list[str]:
     """Overrides that train one of `RUNS` within a budget, all on the same data, in batches of BATCH windows."""
     batch = batch or BATCH
-    return [*TRAININGS[run], f"data.loading.batch_size={batch}", *budget(frames, batch * WINDOW)]
+    return [*TRAININGS[run], f"data.loading.batch_size={batch}", *tabling.budget(frames, batch * WINDOW)]
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -185,11 +155,11 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         makers = [PARTS[part] for part in options.parts] + [partial(_strangers, root) for root in strangers]
         for make in makers:
             title, columns, scores = make(options, progress)
-            found[title] = plain(scores)
+            found[title] = tabling.plain(scores)
             console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
     path = options.output / f"mocap_every{'' if options.sensors == 'typical' else f'_{options.sensors}'}.json"
     facts = {**about, "sensors": options.sensors}
-    return write_tree(path, {"about": facts, "tables": found})
+    return tabling.write_tree(path, {"about": facts, "tables": found})
 
 
 LABELS = {
@@ -247,18 +217,18 @@ CLOCKS = {
 """Benchmarks: what is measured, what is given, and what it is held against."""
 
 
-def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
+def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
     """What docs/results/mocap_every.md says."""
-    body, floor = rows_of(trees, CMU), rows_of(trees, HILLS)
-    online = figures_of(speed, "mocap_every_online_fps")
-    hills = ranged(_over_sensors(floor, "floor follow"))
-    return Page(
+    body, floor = pages.rows_of(trees, CMU), pages.rows_of(trees, HILLS)
+    online = pages.figures_of(speed, "mocap_every_online_fps")
+    hills = pages.ranged(_over_sensors(floor, "floor follow"))
+    return pages.Page(
         title="[MocapEvery](../mocap_every.md): figures",
-        headline=Grid(
+        headline=pages.Grid(
             "Whole recordings, measured where they stand in the world, on CMU's people, a person of another laboratory (HDM05) and "
             "simulated hillsides; distances in cm, jitter as a multiple of the truth's. Rows without other words have typical sensors.",
             ("", *(name for name, _, _ in COLUMNS)),
-            picked(trees, HEADLINE, COLUMNS),
+            pages.picked(trees, HEADLINE, COLUMNS),
         ),
         held_out="Four CMU subjects (dance, walking, running, obstacles), one person of HDM05, and simulated wearers and hillsides of "
         "the test split. Training stops, and settings are chosen, by the validation split. The network was not chosen "
@@ -268,13 +238,13 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "the picture, and poses that another wearer's camera would show. Sizes of errors beside the "
         "literature's are in [simulation](simulation.md).",
         limits=_limits(trees),
-        full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS, "trainings or runs")],
-        commands=commands(trees),
-        measured=f"hillsides {hills} cm; real motion (CMU) {ranged(_over_sensors(body, 'ours'))}; both with ideal to poor sensors",
-        speed=f"{times(online)} online, head poses given ({machines(online)})" if online else "",
+        full=[grid for tree in trees.values() for grid in pages.score_grids(tree, LABELS, "trainings or runs")],
+        commands=pages.commands(trees),
+        measured=f"hillsides {hills} cm; real motion (CMU) {pages.ranged(_over_sensors(body, 'ours'))}; both with ideal to poor sensors",
+        speed=f"{pages.times(online)} online, head poses given ({pages.machines(online)})" if online else "",
         clocks=CLOCKS,
         pictures=(
-            *ranked("mocap_every"),
+            *pages.ranked("mocap_every"),
             (
                 "mocap_every_hillside.png",
                 "Stairs and slopes, truth above and captured below (the floor drawn is that of the beginning)",
@@ -283,29 +253,29 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     )
 
 
-def _over_sensors(rows: dict[str, Tree], row: str) -> list[Tree]:
+def _over_sensors(rows: dict[str, pages.Tree], row: str) -> list[pages.Tree]:
     """Errors of a row with ideal, typical and poor sensors."""
     return [rows[name]["mpjpe_cm"] for name in (f"{row}, ideal sensors", row, f"{row}, poor sensors") if name in rows]
 
 
-def _limits(trees: Trees) -> tuple[str, ...]:
+def _limits(trees: pages.Trees) -> tuple[str, ...]:
     """The weak sides, with their figures."""
-    body, people, floor = (rows_of(trees, title) for title in (CMU, HDM05, HILLS))
-    seeds = rows_of(trees, "Trainings that differ in the seed")
+    body, people, floor = (pages.rows_of(trees, title) for title in (CMU, HDM05, HILLS))
+    seeds = pages.rows_of(trees, "Trainings that differ in the seed")
 
     def errors(row: str, of: str = "mpjpe_cm") -> str:
-        return " and ".join(mean(rows[row][of]) for rows in (body, people) if row in rows)
+        return " and ".join(pages.mean(rows[row][of]) for rows in (body, people) if row in rows)
 
-    rival, three = RIVALS[1], [text(seeds[f"{data}, 3 trainings"]["mpjpe_cm"]) for data in ("cmu", "hdm05")]
-    seen = [mean(body[row]["frames_seen_m"], 2) for row in (rival, "ours", BRIEF)]
+    rival, three = RIVALS[1], [pages.text(seeds[f"{data}, 3 trainings"]["mpjpe_cm"]) for data in ("cmu", "hdm05")]
+    seen = [pages.mean(body[row]["frames_seen_m"], 2) for row in (rival, "ours", BRIEF)]
     return (
         f"Legs are guessed from how head and hands move: the lower body is {errors('ours', 'lower_pe_cm')} cm off on CMU and HDM05. "
         "Nobody in the training dances as CMU's test people do.",
         f"The lead over AGRoL's MLP on watches is small: {errors('ours')} cm against {errors(rival)} on CMU and HDM05. It lies in feet "
         "that slide less and joints that shake less.",
-        f"On hillsides the error follows the head's tracking: {', '.join(mean(each) for each in _over_sensors(floor, 'floor follow'))} cm with "
+        f"On hillsides the error follows the head's tracking: {', '.join(pages.mean(each) for each in _over_sensors(floor, 'floor follow'))} cm with "
         "ideal, typical and poor sensors. A floor that stays as at the beginning gives "
-        f"{mean(floor['floor fixed']['mpjpe_cm'])}.",
+        f"{pages.mean(floor['floor fixed']['mpjpe_cm'])}.",
         f"Three trainings that differ in the seed are {three[0]} cm off on CMU and {three[1]} on HDM05.",
         f"Rivals learned from the same people as ours, in one training at the better of two rates ({seen[0]} million frames; ours "
         f"{seen[1]}), and are captured without mirror averaging and refinement: ours without the one {errors(UNMIRRORED)}, without the "
@@ -313,17 +283,17 @@ def _limits(trees: Trees) -> tuple[str, ...]:
         f"cm of ours beside them, saw {seen[2]} million frames.",
         f"The paper reports {PAPER['paper: AMASS']['mpjpe_cm'].mean:.2f} cm on AMASS, from its own recordings: no comparison. Its network as trained here (“as in the paper”, "
         f"{errors('as in the paper')} cm) is not anchored to the head, and sees no frames after a pose.",
-        *upside_down(body, "mpjpe_cm", "cm", 2),
-        *_viewed(rows_of(trees, "Several wearers")),
+        *pages.upside_down(body, "mpjpe_cm", "cm", 2),
+        *_viewed(pages.rows_of(trees, "Several wearers")),
         "No log of a real watch has been measured.",
     )
 
 
-def _viewed(rows: dict[str, Tree]) -> tuple[str, ...]:
+def _viewed(rows: dict[str, pages.Tree]) -> tuple[str, ...]:
     """What another wearer's view is worth."""
     labels = "estimated", "edited by the other's view"
     cmu, simulated = (
-        " to ".join(mean(rows[f"{data}: frames seen, {label}"]["mpjpe_cm"], 2) for label in labels)
+        " to ".join(pages.mean(rows[f"{data}: frames seen, {label}"]["mpjpe_cm"], 2) for label in labels)
         for data in ("cmu", "simulated")
     )
     return (
@@ -334,15 +304,15 @@ def _viewed(rows: dict[str, Tree]) -> tuple[str, ...]:
 
 def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Tables 2, 5, 6 and 7: held-out CMU subjects, whose heads and watches are simulated."""
-    scores = _people(options, progress, *recordings_of(options, "cmu"))
+    scores = _people(options, progress, *tabling.recordings_of(options, "cmu"))
     title = f"CMU, {options.split}, {options.sensors} sensors (hands tracked: exact, floor and bones given)"
-    return titled(f"Tables 2, 6, 7: {title}", options), BODY, scores | ({} if options.keep else PAPER)
+    return tabling.titled(f"Tables 2, 6, 7: {title}", options), BODY, scores | ({} if options.keep else PAPER)
 
 
 def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """The same rows on people of another laboratory."""
-    scores = _people(options, progress, *split_of(options, root))
-    return titled(f"People ({root.name}): {options.split}, {options.sensors} sensors", options), BODY, scores
+    scores = _people(options, progress, *tabling.split_of(options, root))
+    return tabling.titled(f"People ({root.name}): {options.split}, {options.sensors} sensors", options), BODY, scores
 
 
 def _people(
@@ -359,21 +329,21 @@ def _people(
             for seed, method in enumerate(methods)
             for recording, _, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
-        scores[name] = aggregate(scored) | training_of(*(method.checkpoint for method in methods))
+        scores[name] = aggregate(scored) | tabling.training_of(*(method.checkpoint for method in methods))
         if name in ("ours", GIVEN_ALL):
-            scores |= upright(name, scored)
+            scores |= tabling.upright(name, scored)
     return scores | {"truth": truth_row(scores[next(reversed(rows))])}
 
 
 def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Our checkpoint, of seed 0, beside the mean and spread of it and of the same training with seeds 1 and 2, which are
     mocap_every_mlp_1 and mocap_every_mlp_2 in RUNS."""
-    others = [str(path) for path in trainings_of(options.runs, MLP) if path.parents[1].name != MLP]
+    others = [str(path) for path in tabling.trainings_of(options.runs, MLP) if path.parents[1].name != MLP]
     trained = {"ours": [options.checkpoint], f"{1 + len(others)} trainings": [options.checkpoint, *others]}
     sensing = {"": (options.sensors, ()), ", exact sensors, floor and bones given": (GIVEN, ("pipeline.floor=fixed",))}
     scores: Scores = {}
     for root in (options.datasets / "cmu", *options.strangers):
-        store, names = split_of(options, root)
+        store, names = tabling.split_of(options, root)
         for (label, checkpoints), (given, (sensors, pipeline)) in product(trained.items(), sensing.items()):
             name, scored = f"{root.name}, {label}{given}", []
             bar = progress.add_task(name, total=len(checkpoints) * len(names))
@@ -381,7 +351,7 @@ def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tu
                 method = Method(name, checkpoint, sensors, ("pipeline=mocap_every", *pipeline))
                 found = captures(method, store, names, lambda b=bar: progress.advance(b))
                 scored += [body_row(recording, captured, seed) for recording, _, captured in found]
-            scores |= {name: aggregate(scored) | training_of(*checkpoints)} | upright(name, scored)
+            scores |= {name: aggregate(scored) | tabling.training_of(*checkpoints)} | tabling.upright(name, scored)
     return f"Trainings that differ in the seed: {options.split}, {options.sensors} sensors", BODY, scores
 
 
@@ -410,13 +380,13 @@ def _rivals(options: argparse.Namespace, console: Console) -> dict[str, list[Met
     """Methods of the rows with trainings of their own, by seed; those without a checkpoint are named and left out."""
     trained = {}
     for name, (run, pipeline) in TRAINED.items():
-        paths = trainings_of(options.runs, run)
+        paths = tabling.trainings_of(options.runs, run)
         sensors = GIVEN if run in HANDS else options.sensors
         overrides = (*pipeline, "pipeline.floor=fixed", "pipeline.refinement=null")
         trained[name] = [Method(name, str(path), sensors, overrides) for path in paths]
         if not paths:
             path = options.runs / run / "checkpoints" / "best.ckpt"
-            console.print(left_out(name, "mocap_every", run, path), markup=False, soft_wrap=True)
+            console.print(tabling.left_out(name, "mocap_every", run, path), markup=False, soft_wrap=True)
     return {name: methods for name, methods in trained.items() if methods}
 
 
@@ -428,7 +398,7 @@ def _totalcapture(options: argparse.Namespace, progress: Progress) -> tuple[str,
     path = options.runs / run / "checkpoints" / "best.ckpt"
     if path.is_file():
         methods.append(Method("as in the paper", str(path), GIVEN, (*pipeline, level)))
-    store, _ = recordings_of(options, "totalcapture")
+    store, _ = tabling.recordings_of(options, "totalcapture")
     names = store.names()[: 3 if options.quick else options.recordings]
     scores = {}
     for method in methods:
@@ -440,7 +410,7 @@ def _totalcapture(options: argparse.Namespace, progress: Progress) -> tuple[str,
 
 def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 3: stairs and ramps between terraces at -4 to 4 m."""
-    store, names = recordings_of(options, "simulated_hillside")
+    store, names = tabling.recordings_of(options, "simulated_hillside")
     methods = [
         Method(
             f"floor {floor}", options.checkpoint, options.sensors, ("pipeline=mocap_every", f"pipeline.floor={floor}")
@@ -488,7 +458,7 @@ def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
     )
     scores: Scores = {}
     for data, label, solver in rows:
-        store, names = recordings_of(options, data)
+        store, names = tabling.recordings_of(options, data)
         bar = progress.add_task(f"cues: {data}, {label}", total=len(names))
         pairs = []
         for name in names:
@@ -509,7 +479,7 @@ def _several(options: argparse.Namespace, progress: Progress) -> tuple[str, tupl
     """§3.4, φ_T, of which the paper gives no figures: poses as the other wearer's head camera sees them."""
     editor = load_visual_cues(options.manifold)
     pipeline = pipeline_of(Method("ours", options.checkpoint, options.sensors))
-    store, names = recordings_of(options, "cmu")
+    store, names = tabling.recordings_of(options, "cmu")
     people = [watched_person(store.load(name), options.split) for name in names]
     pairs = [watched_pair(options.split, number) for number in range(2 if options.quick else options.pairs)]
     sessions: dict[str, list[list[Watched]]] = {

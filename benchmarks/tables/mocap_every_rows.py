@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from benchmarks.rivals import compose
 from benchmarks.tables.sensed import sensed
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
-from wearcap.cli.conf import compose, load_pipeline
+from wearcap.cli.conf import load_pipeline
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.position import joint_error_cm
 from wearcap.metrics.scores import score_in_world, truth_at

@@ -1,7 +1,7 @@
 """Conversion of motion capture in any skeleton to ground truth: one rate, no glitches, a level floor, contacts, a head path."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import torch
@@ -28,15 +28,15 @@ _STANDING, _LEAST_STANDING = 0.25, 10
 class CleaningLimits:
     """Thresholds for a glitch, a planted foot and a level floor."""
 
-    max_trunk_speed: float | int
+    max_trunk_speed: float | int = 8.0
     """Largest speed of `TRUNK`'s joints (m/s); sprinters reach 12, CMU's runners 5."""
-    max_limb_speed: float | int
+    max_limb_speed: float | int = 15.0
     """Largest speed of all other joints (m/s); a kicking foot reaches 14 in CMU."""
-    contact_speed: float | int
+    contact_speed: float | int = 0.5
     """Speed (m/s) below which a foot patch may be in contact."""
-    contact_height: float | int
+    contact_height: float | int = 0.06
     """Height above the floor (m) below which a slow foot patch is in contact."""
-    level_within: float | int
+    level_within: float | int = 0.12
     """Spread (m, 5th to 95th percentile) of the lowest planted patch's height up to which the floor is level."""
 
 
@@ -44,10 +44,13 @@ class CleaningLimits:
 class MocapSettings:
     """Settings of the conversion of motion capture without sensors to a recording."""
 
-    fps: float | int
-    t_head_device: Sequence[float]
+    fps: float | int = 60
+    t_head_device: Sequence[float] = (0.09, 0.0, 0.09)
     """Nominal position of a head-mounted device in the head joint's frame (m)."""
-    limits: CleaningLimits
+    limits: CleaningLimits = field(default_factory=CleaningLimits)
+
+
+MOCAP = MocapSettings()
 
 
 @dataclass(frozen=True)

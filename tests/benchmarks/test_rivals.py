@@ -8,13 +8,16 @@ from pathlib import Path
 import pytest
 from rich.progress import Progress
 
+from benchmarks.rivals import compose
 from benchmarks.rivals import trainings as rivals
+from benchmarks.rivals.pose_regression.net import PoseRegressor
+from benchmarks.rivals.pose_regression.training import PoseRegression
 from benchmarks.tables import echo as tables
 from benchmarks.tables import hmd2_runs as runs
 from benchmarks.tables import tabling
-from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Row, Summary
+from wearcap.models.build import brought_up_to_date, target_of
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap_testing import small_dataset
 
@@ -190,3 +193,11 @@ def test_a_row_of_echo_captures_each_training_with_a_seed_of_its_own(two_trainin
     ]
     alone = tables.Method("ours", "echo")
     assert list(tables._captured(alone, options, Progress(), None, ["walk"])) == [("echo", [0, 1, 2, 3], ())]
+
+
+def test_checkpoints_of_rivals_that_name_the_places_of_before_still_load():
+    old = "wearcap.systems.hmd2.pose_regressor.training.PoseRegression"
+    config = {"_target_": old, "net": {"_target_": "wearcap.models.pose_regressor.PoseRegressor", "_partial_": True}}
+    brought_up_to_date(config)
+    assert target_of(config["_target_"]) is PoseRegression
+    assert target_of(config["net"]["_target_"]) is PoseRegressor

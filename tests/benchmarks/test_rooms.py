@@ -25,7 +25,6 @@ SMALLEST: dict[str, dict] = {
     "carried_heads": {"folders": ()},
     "contact_seconds_per_minute": {"seconds": 2.0, "rounds": 1},
     "contact_sequence_vs_window": {"seconds": 1.0, "rounds": 1},
-    "echo_conveyor_vs_rewindow": {"items": 1, "rounds": 1, "recordings": 0},
     "echo_online_small_fps": {"frames": 4, "repeats": 1},
     "faults": {"kills": 0},
     "hmd2_online_full_fps": {"pushes": 1},
@@ -46,7 +45,6 @@ SMALLEST: dict[str, dict] = {
 }
 """Arguments of each benchmark that is small in seconds."""
 LARGE = {
-    "hmd2_train_mfu": "a CUDA device",
     "hmd2_runner_vs_eager": "five streams side by side, of up to twenty steps",
     "hps_constants": "simulated sessions of 110 m",
     "hps_end_to_end_realtime": "a filmed session and its map",

@@ -8,6 +8,7 @@ import av
 import numpy as np
 import pytest
 
+from benchmarks.rivals import SEARCH
 from wearcap.cli import capture, evaluate
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
@@ -74,7 +75,8 @@ def test_a_data_set_is_scored(data, tmp_path, capfd):
     scores = written["methods"]["hps"]
     assert scores["world_root_cm"]["mean"] < 8
     assert {path.name for path in (tmp_path / "cache").iterdir()} == {"walk", "other"}
-    evaluate.main([f"dataset={data}", "pipeline=baseline/hps_imu", f"output={table}", f"hydra.run.dir={tmp_path}"])
+    suit = [SEARCH, "pipeline=baseline/hps_suit", "pipeline.kind=imu"]
+    evaluate.main([*suit, f"dataset={data}", f"output={table}", f"hydra.run.dir={tmp_path}"])
     imu = json.loads(table.read_text())["methods"]["imu"]
     assert imu["world_root_cm"]["mean"] > scores["world_root_cm"]["mean"]
 

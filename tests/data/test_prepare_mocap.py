@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from data_prep.amass import amass_tasks
-from data_prep.bvh import Hips, bvh_tasks
+from data_prep.bvh import bvh_tasks
 from data_prep.cmu import cmu_tasks
 from data_prep.shared.engine import Splits, check_recording
 from data_prep.shared.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
@@ -32,7 +32,6 @@ from wearcap.recording.timing import resampled
 LIMITS = CleaningLimits(8.0, 15.0, 0.5, 0.06, 0.12)
 SETTINGS = MocapSettings(60.0, (0.09, 0.0, 0.09), LIMITS)
 ABOUT = About("a", "1", "test", "none")
-KEPT = Hips(False, (0.0, 0.0))
 SPLITS = Splits(Path("any.csv"), (("*", "train"),))
 
 
@@ -286,7 +285,7 @@ def test_every_kind_of_cmu_trial_becomes_a_recording(real_data):
     config = compose("prepare", ["prepare=cmu"])
     splits = Splits.read(splits_dir() / "cmu.csv")
     tasks = cmu_tasks(
-        real_data / "cmu_mocap", splits, SETTINGS, config.amc_fps, "CMU", Hips(config.repair, list(config.usual_m))
+        real_data / "cmu_mocap", splits, SETTINGS, config.amc_fps, "CMU", config.repair, list(config.usual_m)
     )
     indices = [path.read_text(encoding="utf-8") for path in (real_data / "cmu_mocap").glob("index*.csv")]
     assert len(tasks) == sum(len(text.splitlines()) - 1 for text in indices) >= 240
@@ -321,7 +320,7 @@ def test_xz_and_plain_give_the_same_recording(real_data, tmp_path):
     plain.write_bytes(read_bytes(folder / "35_20.amc.xz"))
     shutil.copy(folder / "35.asf", tmp_path)
     first, second = (
-        next(task for task in bvh_tasks(file, SPLITS, SETTINGS, 120, "CMU", KEPT)).make().motion
+        next(task for task in bvh_tasks(file, SPLITS, SETTINGS, 120, "CMU", False)).make().motion
         for file in (folder / "35_20.amc.xz", plain)
     )
     assert first is not None
@@ -354,7 +353,7 @@ def foreign_folder(tmp_path) -> Path:
 def test_subjects_follow_a_pattern_the_folder_or_a_name(rule, subjects, warned, foreign_folder):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        tasks = bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", KEPT, subject=rule)
+        tasks = bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", False, subject=rule)
     assert [task.name for task in tasks] == [f"{p}__{p}-{take}" for p in ("anna", "ben") for take in ("a", "b")]
     assert {task.make.args[2].subject for task in tasks} == subjects  # pyright: ignore[reportFunctionMemberAccess]
     assert any("subject=" in str(warning.message) for warning in caught) == warned
@@ -365,7 +364,7 @@ def test_subjects_follow_a_pattern_the_folder_or_a_name(rule, subjects, warned, 
 )
 def test_a_pattern_that_finds_no_subject_is_refused(rule, message, foreign_folder):
     with pytest.raises(WearcapError, match=message):
-        bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", KEPT, subject=rule)
+        bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", False, subject=rule)
 
 
 def test_foreign_files_become_recordings_and_what_the_doctor_refuses_does_not(foreign_folder, capfd):
@@ -400,7 +399,7 @@ def test_foreign_files_become_recordings_and_what_the_doctor_refuses_does_not(fo
 
 @pytest.mark.real
 def test_another_laboratorys_files_land_in_its_people(real_data):
-    tasks = bvh_tasks(real_data / "hdm05" / "trials", SPLITS, SETTINGS, 120, "none", KEPT)
+    tasks = bvh_tasks(real_data / "hdm05" / "trials", SPLITS, SETTINGS, 120, "none", False)
     subjects = [task.make.args[2].subject for task in tasks]  # pyright: ignore[reportFunctionMemberAccess]
     assert len(subjects) == 232
     assert set(subjects) == {"HDM_bd", "HDM_bk", "HDM_dg", "HDM_mm"}
@@ -410,7 +409,7 @@ def test_another_laboratorys_files_land_in_its_people(real_data):
 @pytest.mark.slow
 def test_standing_soles_lie_on_the_floor(real_data):
     """Heels and toe tips of CMU's standing feet; when soles kept the bind pose's tilt, heels were at 1.5 cm in the median."""
-    tasks = {task.name: task for task in cmu_tasks(real_data / "cmu_mocap", SPLITS, SETTINGS, 120, "CMU", KEPT)}
+    tasks = {task.name: task for task in cmu_tasks(real_data / "cmu_mocap", SPLITS, SETTINGS, 120, "CMU", False)}
     heights = []
     for name in ("07_01", "10_01", "14_14", "16_05", "35_20", "55_28", "13_29", "29_01", "127_03", "43_02"):
         if name not in tasks:

@@ -19,7 +19,7 @@ def tasks_of(root: Path, **changes):
         "fps": 60,
         "camera_fps": 30,
         "suit": "typical",
-        "localization": "typical",
+        "camera_errors": "typical",
         "returns_m": [],
         "end_m": 15,
         "spacing_m": 0.4,

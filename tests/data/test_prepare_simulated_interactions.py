@@ -15,7 +15,7 @@ SPLITS = Splits.read(Path(__file__).parents[2] / "data_prep/splits/simulated.csv
 
 
 def tasks(output, recordings, **how):
-    sensors = {"suit": "typical", "localization": "poor", "measured": True}
+    sensors = {"suit": "typical", "camera_errors": "poor", "measured": True}
     settings = {"minutes": 0.2, "fps": 30, "camera_fps": 10, "spacing_m": 0.08, "seed": 0} | sensors | how
     return simulated_interactions_tasks(SPLITS, str(output), recordings, **settings)
 

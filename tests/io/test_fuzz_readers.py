@@ -1,4 +1,4 @@
-"""A short run of benchmarks/faults/fuzz_readers.py: every reader, some damaged files."""
+"""A short run of tests/fuzz_readers.py: every reader, some damaged files."""
 
 import json
 import os
@@ -9,8 +9,8 @@ from subprocess import run
 
 import pytest
 
-from benchmarks.faults import fuzz_readers
-from benchmarks.faults.fuzz_readers import READERS, failed, fuzz, outcome
+import fuzz_readers
+from fuzz_readers import READERS, failed, fuzz, outcome
 from valid_files import Reader
 
 ROOT = Path(__file__).parents[2]
@@ -22,7 +22,7 @@ BOUNDED = {"aria_vrs"}
 
 def rows_of(*arguments: str) -> list[dict]:
     """The lines that the program prints, and its total."""
-    command = [sys.executable, "-m", "benchmarks.faults.fuzz_readers", *arguments]
+    command = [sys.executable, "tests/fuzz_readers.py", *arguments]
     done = run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.stdout, done.stderr[-3000:]
     return [json.loads(line) for line in done.stdout.splitlines()]

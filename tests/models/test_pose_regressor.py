@@ -3,12 +3,12 @@
 import pytest
 import torch
 
+from benchmarks.rivals.pose_regression.features import TrackedPoints, pasts
+from benchmarks.rivals.pose_regression.net import PoseRegressor
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.models.pose_regressor import PoseRegressor
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, pasts
 from wearcap_testing import swaying_motion
 
 HANDS = ("head", "left_wrist", "right_wrist")

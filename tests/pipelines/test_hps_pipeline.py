@@ -12,6 +12,8 @@ from hps_walk import CLAPS_S, MOUNT, floor_points, hps_dataset, hps_recording
 from hydra.utils import instantiate
 from PIL import Image
 
+from benchmarks.rivals import SEARCH
+from benchmarks.rivals.hps_suit import HpsBaseline
 from wearcap.body.kinematics import local_rotations
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
@@ -33,8 +35,7 @@ from wearcap.systems.hps.camera import MapLocalization, Synchronization
 from wearcap.systems.hps.constants import ConstantsPrior
 from wearcap.systems.hps.energy import HpsEnergy
 from wearcap.systems.hps.pipeline import HPS, at_frames
-from wearcap.systems.hps.published import HpsBaseline
-from wearcap.systems.ireplica.published import BentSuit
+from wearcap.systems.ireplica.bent_suit import BentSuit
 from wearcap.systems.ireplica.trajectory import Bending, bend
 from wearcap.systems.ireplica.trajectory_banded import bend_banded
 
@@ -344,7 +345,7 @@ def test_landmarks_are_tracked_between_key_frames(filmed, monkeypatch):
         (["pipeline=hps"], True),
         (["pipeline=hps", "head_camera@pipeline=each_frame"], False),
         (["pipeline=paper/hps"], False),
-        (["pipeline=baseline/hps_imu_cam"], False),
+        ([SEARCH, "pipeline=baseline/hps_suit"], False),
     ],
 )
 def test_landmarks_are_tracked_by_default_and_not_in_published_rows(choices, tracks):

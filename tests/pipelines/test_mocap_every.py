@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from benchmarks.rivals.last_pose import LastPoseEstimator
 from watched_walk import WINDOW, drawn_pipeline, watched_walk
 from wearcap.data.transforms import joint_twins
 from wearcap.errors import WearcapError
@@ -12,7 +13,6 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.metrics.scores import score_in_world
 from wearcap.recording import HeadStream, ImuStream
 from wearcap.systems.mocap_every.features import WatchFeatures
-from wearcap.systems.mocap_every.model import LastPoseEstimator
 
 
 @pytest.fixture(scope="module")

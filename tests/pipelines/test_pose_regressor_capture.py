@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from benchmarks.rivals.pose_regression.features import TrackedPoints
+from benchmarks.rivals.pose_regression.net import PoseRegressor
+from benchmarks.rivals.pose_regression.pipeline import PoseRegressorCapture
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
-from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints
-from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
 from wearcap_testing import recording_of, swaying_motion
 
 HANDS = ("head", "left_wrist", "right_wrist")

@@ -94,7 +94,7 @@ def test_derivative_of_the_energy(settings):
 
 def test_steps_take_the_turn_of_the_last_one_that_moves():
     path = torch.tensor([[0.0, 0], [0, 0], [0, 1], [0, 1], [0, 1], [-1, 1]]).double()
-    problem = bending_problem(path, torch.arange(6).double(), torch.zeros(0).double(), path[:0], None, Bending())
+    problem = bending_problem(path, torch.arange(6).double(), torch.zeros(0).double(), path[:0], None, Bending(10.0))
     assert problem.leader.tolist() == [1, 1, 1, 1, 4]
 
 
@@ -235,7 +235,7 @@ def test_degenerate_paths(solver):
     timestamps = torch.arange(5).double()
     still, walk = torch.ones(5, 2), torch.arange(10.0).reshape(5, 2)
     for free in (False, True):
-        settings = Bending(free_start=free, clamped_ends=free)
+        settings = Bending(10.0, free_start=free, clamped_ends=free)
         unheld = bend(walk, timestamps, timestamps[:0], walk[:0], settings=settings, solver=solver)
         torch.testing.assert_close(unheld.path, walk.double(), rtol=0.0, atol=1e-6)
         stands = bend(still, timestamps, timestamps[1:2], still[:1] + 3, settings=settings, solver=solver)
@@ -268,13 +268,13 @@ def test_bad_input_is_refused(change, message):
         "weights": torch.ones(2),
     }
     with pytest.raises(WearcapError, match=message):
-        bend(**(known | change), settings=Bending(), solver=bend_banded)
+        bend(**(known | change), settings=Bending(10.0), solver=bend_banded)
 
 
 def test_bad_settings_are_refused():
     for wrong in ({"rigidity": 0.0}, {"rigidity": math.nan}, {"norm": "cubic"}):
         with pytest.raises(WearcapError):
-            Bending(**wrong)
+            Bending(**({"rigidity": 1.0} | wrong))
 
 
 def _least(solved) -> float:

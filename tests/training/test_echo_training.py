@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.rivals import SEARCH
 from benchmarks.tables import echo
 from benchmarks.tables import echo_rows as rows
 from carried_box import WINDOW, carried_dataset, carrying, small_features, small_net
@@ -289,6 +290,7 @@ def arguments(experiment: str, data: str, people: str, run: Path, *more: str) ->
         "data.sources.cmu.weight=0.3",
         "people@data.sources=none",
         "debug=fast",
+        SEARCH,
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",
         f"data.dataset.window={WINDOW}",

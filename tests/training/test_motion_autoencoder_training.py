@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.rivals import SEARCH
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.errors import WearcapError
@@ -79,6 +80,7 @@ def test_evaluation_shows_it_beside_the_other_scores(checkpoint, data, tmp_path,
     run = tmp_path / "regressor"
     train.main(
         [
+            SEARCH,
             "experiment=pose_regressor_head",
             f"data.sources.simulated.root={data}",
             "data.dataset.window=60",
@@ -98,6 +100,7 @@ def test_evaluation_shows_it_beside_the_other_scores(checkpoint, data, tmp_path,
     )
     evaluate.main(
         [
+            SEARCH,
             f"checkpoint={run}/checkpoints/last.ckpt",
             "pipeline=pose_regressor",
             f"realism={checkpoint}",

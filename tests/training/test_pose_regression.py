@@ -9,17 +9,17 @@ import torch
 from hydra.utils import instantiate
 from torch import nn
 
+from benchmarks.rivals import SEARCH, compose
+from benchmarks.rivals.pose_regression.features import TrackedPoints
+from benchmarks.rivals.pose_regression.net import PoseRegressor
+from benchmarks.rivals.pose_regression.training import PoseRegression
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
-from wearcap.cli.conf import compose
 from wearcap.data.transforms import Mirror, Shift
 from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained
-from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints
-from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
 from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap_testing import small_dataset
 
@@ -36,6 +36,7 @@ def data(tmp_path_factory):
 
 def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
     return [
+        SEARCH,
         f"experiment={experiment}",
         f"data.sources.simulated.root={data}",
         "debug=fast",
@@ -150,7 +151,7 @@ def test_trained_evaluated_and_refused(data, tmp_path):
     assert config["model"]["points"]["points"] == list(HANDS)
     with open(run / "metrics.csv") as file:
         assert [row["train/joints"] for row in csv.DictReader(file) if row["train/joints"]]
-    common = [f"checkpoint={checkpoint}", f"hydra.run.dir={tmp_path}/e", "seeds=[0]", "baselines=false"]
+    common = [SEARCH, f"checkpoint={checkpoint}", f"hydra.run.dir={tmp_path}/e", "seeds=[0]", "baselines=false"]
     evaluate.main([*common, "pipeline=pose_regressor", f"output={tmp_path}/table.json"])
     scores = json.loads((tmp_path / "table.json").read_text())["methods"]["wearcap"]
     assert 0 < scores["hand_pe_cm"]["mean"] < scores["mpjpe_cm"]["mean"] + 10
@@ -159,13 +160,7 @@ def test_trained_evaluated_and_refused(data, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("experiment", "inputs"),
-    [
-        ("full/pose_regressor_head", 18),
-        ("full/pose_regressor_hands", 54),
-        ("baseline/avatarposer_head", 18),
-        ("baseline/avatarposer_hands", 54),
-    ],
+    ("experiment", "inputs"), [("baseline/avatarposer_head", 18), ("baseline/avatarposer_hands", 54)]
 )
 def test_the_full_size_is_avatarposers(experiment, inputs):
     """4.12 M parameters (Jiang et al. 2022), with their 22 joints for our 23."""
@@ -199,6 +194,7 @@ def test_a_baseline_learns_in_a_few_steps_and_captures(experiment, pipeline, dat
     windows = ["pipeline.sampling.steps=2", "pipeline.overlap.stride=50"]
     evaluate.main(
         [
+            SEARCH,
             f"checkpoint={run}/checkpoints/last.ckpt",
             f"hydra.run.dir={tmp_path}/e",
             "seeds=[0]",

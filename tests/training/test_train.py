@@ -18,22 +18,7 @@ from wearcap.models.checkpoint import load_trained, read_checkpoint
 from wearcap_testing import experiments, small_dataset
 
 EXPERIMENTS = experiments("motion_diffusion")
-KINDS = (
-    "motion_",
-    "contact_",
-    "pose_regressor_",
-    "egoego_",
-    "egoallo_",
-    "agrol_",
-    "avatarposer_",
-    "egoview",
-    "voxel_autoencoder",
-    "hmd2",
-    "mocap_every",
-    "object_encoder",
-    "echo",
-    "bodiffusion",
-)
+KINDS = ("motion_", "contact_", "egoview", "voxel_autoencoder", "hmd2", "mocap_every", "object_encoder", "echo")
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 
 
@@ -77,7 +62,7 @@ def test_every_experiment_takes_a_step(experiment, data, tmp_path):
 
 
 def test_every_experiment_is_tried_by_a_test():
-    """Each kind in a module of its own: contact detection in test_contact_detection, baselines in test_pose_regression,
+    """Each kind in a module of its own: contact detection in test_contact_detection,
     the autoencoder of FID in test_motion_autoencoder_training, of points in test_voxel_reconstruction, ours of pictures
     in test_egoview, all that sees them in test_hmd2_training; MocapEvery and its manifold in test_watch_regression; of
     objects in test_object_encoding; ECHO in test_echo_training."""

@@ -8,6 +8,8 @@ import torch
 from hydra.utils import instantiate
 from torch import nn
 
+from benchmarks.rivals import SEARCH
+from benchmarks.rivals.last_pose import LastPoseEstimator
 from benchmarks.tables import mocap_every
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
@@ -20,7 +22,7 @@ from wearcap.models.checkpoint import load_trained
 from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.manifold_training import ManifoldTraining
-from wearcap.systems.mocap_every.model import Estimate, LastPoseEstimator, MLPEstimator, TwoStageEstimator
+from wearcap.systems.mocap_every.model import Estimate, MLPEstimator, TwoStageEstimator
 from wearcap.systems.mocap_every.training import WatchRegression
 from wearcap.systems.mocap_every.training_windows import WatchContent
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
@@ -56,6 +58,7 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
         "people@data.sources=none",
         f"data.val_sources.cmu.root={data}",
         "debug=fast",
+        SEARCH,
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",
         "trainer.accelerator=cpu",

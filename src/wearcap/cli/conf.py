@@ -28,6 +28,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from wearcap.cli.sources import register
 from wearcap.cli.stated import stated
 from wearcap.cli.verbs import conf_dir
 from wearcap.errors import WearcapError, nearest
@@ -53,6 +54,8 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
     Raises WearcapError that names the nearest valid key or choice when an override is mistyped.
     """
     overrides = list(overrides)
+    if config_name == "prepare":
+        register(overrides, splits_dir())
     with explained(config_name, overrides):
         return _compose(config_name, [*map(readable, overrides)])
 

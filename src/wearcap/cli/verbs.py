@@ -1,11 +1,15 @@
 """The verbs, their help and their one style of arguments, without the imports of a verb: help is there at once."""
 
 import argparse
+import ast
+import functools
+import importlib.util
+import itertools
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
@@ -48,9 +52,36 @@ def conf_dir() -> Path:
     return resource("conf", "conf")
 
 
-def sources() -> dict[str, Path]:
-    """Sources of `prepare` by name: the configs of `conf/prepare/`."""
-    return {path.stem: path for path in sorted((conf_dir() / "prepare").glob("*.yaml"))}
+GIVEN = ("output", "jobs", "backend", "scheduler", "overwrite")
+"""Settings of a source that all have, from `conf/prepare.yaml`."""
+
+
+class Source(NamedTuple):
+    """A source of `prepare`: the function of a file in `data_prep/` whose arguments are its settings."""
+
+    file: Path
+    entry: ast.FunctionDef
+    about: str
+    defaults: dict[str, Any]
+    """Settings whose defaults are not the function's own."""
+
+
+@functools.cache
+def sources() -> dict[str, Source]:
+    """Sources by name: files NAME.py of `data_prep/` with a function NAME_tasks or NAME_rework, and their VARIANTS."""
+    found, package = dict[str, Source](), importlib.util.find_spec("data_prep")
+    for folder in (package and package.submodule_search_locations) or ():
+        for file in Path(folder).glob("*.py"):
+            tree, name = ast.parse(file.read_text(encoding="utf-8")), file.stem
+            entries = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+            assigned = (node for node in tree.body if isinstance(node, ast.Assign))
+            variants = next(
+                (ast.literal_eval(node.value) for node in assigned if ast.unparse(node.targets[0]) == "VARIANTS"), {}
+            )
+            for entry in (each for each in entries if each.name in (f"{name}_tasks", f"{name}_rework")):
+                found[name] = Source(file, entry, (ast.get_docstring(tree) or "").split("\n\n")[0], {})
+                found |= {key: Source(file, entry, values.pop("about"), values) for key, values in variants.items()}
+    return dict(sorted(found.items()))
 
 
 def overrides(verb: str, arguments: Sequence[str]) -> list[str]:
@@ -141,35 +172,55 @@ def help_of(verb: str, arguments: Sequence[str]) -> str | None:
         return _help_of_prepare(words)
     config = "calibrate_watches" if verb == "calibrate" and "steps=watches" in arguments else verb
     file = conf_dir() / f"{config}.yaml"
-    return None if words[:1] == ["edit"] or not file.is_file() else _help_of_config(f"wearcap {verb}", [file])
+    return None if words[:1] == ["edit"] or not file.is_file() else _help_of_config(f"wearcap {verb}", file)
 
 
 def _help_of_prepare(words: Sequence[str]) -> str:
     if words and words[0] in sources():
-        return _help_of_config(f"wearcap prepare {words[0]}", [sources()[words[0]], conf_dir() / "prepare.yaml"])
-    rows = [(name, _about(path.read_text(encoding="utf-8"))[0]) for name, path in sources().items()]
-    rows = [(name, textwrap.shorten(text, COLUMNS - 24, placeholder=" …")) for name, text in rows]
+        source = sources()[words[0]]
+        rows, more = _signature(source) + _help_rows(conf_dir() / "prepare.yaml")[0], f"Others: see {source.file}."
+        return page([source.about], f"wearcap prepare {words[0]}", rows, [more])
+    rows = [(name, textwrap.shorten(each.about, COLUMNS - 24, placeholder=" …")) for name, each in sources().items()]
     return page([VERBS["prepare"]], "wearcap prepare SOURCE", rows, ["wearcap prepare SOURCE --help: its settings."])
+
+
+def _signature(source: Source) -> list[tuple[str, str]]:
+    """(key=value, text) of a source's settings that have a comment, behind an argument or above it."""
+    lines, rows = source.file.read_text(encoding="utf-8").splitlines(), []
+    arguments = source.entry.args
+    for argument, default in zip(arguments.args[::-1], [*arguments.defaults[::-1], *[None] * len(arguments.args)]):
+        place = argument.lineno - 1
+        above = list(itertools.takewhile(lambda line: line.lstrip().startswith("# "), lines[place - 1 :: -1]))
+        text = lines[place].partition("  # ")[2] or " ".join(line.strip("# ") for line in above[::-1])
+        value = source.defaults.get(argument.arg)
+        if value is None and isinstance(default, ast.Constant | ast.Tuple):
+            value = ast.literal_eval(default)
+        shown = str(list(value)).replace(" ", "") if isinstance(value, tuple) else str(value)
+        shown = "…" if value is None or " " in shown else shown.lower() if isinstance(value, bool) else shown
+        rows += [(f"{argument.arg}={shown}", text)] if text else []
+    return rows[::-1]
 
 
 def _about(text: str) -> list[str]:
     """The comments at the top of a config."""
-    return re.findall(r"^# (?!@)(.*)", re.split(r"^\w", text, maxsplit=1, flags=re.MULTILINE)[0], re.MULTILINE)
+    return re.findall(r"^# (.*)", re.split(r"^\w", text, maxsplit=1, flags=re.MULTILINE)[0], re.MULTILINE)
 
 
-def _help_of_config(command: str, files: Sequence[Path]) -> str:
-    texts = [file.read_text(encoding="utf-8") for file in files]
-    rows, others = [], []
-    for text in texts:
-        shown = True
-        for block in text.split("\nhydra:")[0].split("\n\n"):
-            settings = _settings(block)
-            rows += [(key, note) for key, note in settings if note] if shown else []
-            others += [key.split("=")[0] for key, note in settings if not (shown and note)]
-            shown = shown and not settings
-        rows += _groups(text)
-    more = [f"Also {', '.join(others)}: see {files[0]}."] if others else []
-    return page(_about(texts[0]), command, rows, more)
+def _help_of_config(command: str, file: Path) -> str:
+    rows, others = _help_rows(file)
+    more = [f"Also {', '.join(others)}: see {file}."] if others else []
+    return page(_about(file.read_text(encoding="utf-8")), command, rows, more)
+
+
+def _help_rows(file: Path) -> tuple[list[tuple[str, str]], list[str]]:
+    """Settings of a config up to the first empty line with their texts, and names of the others."""
+    text, rows, others, shown = file.read_text(encoding="utf-8"), [], [], True
+    for block in text.split("\nhydra:")[0].split("\n\n"):
+        settings = _settings(block)
+        rows += [(key, note) for key, note in settings if note] if shown else []
+        others += [key.split("=")[0] for key, note in settings if not (shown and note)]
+        shown = shown and not settings
+    return rows + _groups(text), others
 
 
 def _groups(text: str) -> list[tuple[str, str]]:
@@ -185,7 +236,7 @@ def _settings(block: str) -> list[tuple[str, str]]:
     """(key=value, its comment) of the settings at the top level of a block of YAML; comments go on in lines of their own."""
     found: list[tuple[str, str]] = []
     for line in block.splitlines():
-        if (match := re.match(r"(\w+): *(.*?)(?: +# (.*))?$", line)) and match[1] not in ("defaults", "tasks"):
+        if (match := re.match(r"(\w+): *(.*?)(?: +# (.*))?$", line)) and match[1] != "defaults":
             plain = re.fullmatch(r"[\w.:/-]+|\[.*\]", match[2]) and match[2] != "null"
             value = match[2].replace(" ", "") if plain else "…"
             found.append((f"{match[1]}={value}", match[3] or ""))

@@ -132,9 +132,7 @@ class VisualMap:
 
     def save(self, path: str | Path) -> None:
         """Write one .safetensors file, atomically."""
-        header = _Header(
-            SCHEMA_VERSION, self.extractor, self.descriptor, self.names, self.cameras, float(self.cell_m)
-        )
+        header = _Header(SCHEMA_VERSION, self.extractor, self.descriptor, self.names, self.cameras, float(self.cell_m))
         arrays = {
             "R_world_cam": self.T_world_cam.R,
             "t_world_cam": self.T_world_cam.t,

@@ -30,7 +30,6 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.echo.features": ("EchoFeatures",),
     "wearcap.systems.hmd2.features": ("HeadFeatures",),
     "wearcap.data.motion_features": ("MotionFeatures",),
-    "wearcap.systems.hmd2.pose_regressor.features": ("TrackedPoints",),
     "wearcap.systems.mocap_every.features": ("WatchFeatures",),
     "wearcap.diffusion.levels": ("LevelMix",),
     "wearcap.diffusion.schedule": ("CosineSchedule", "LinearSchedule"),
@@ -42,9 +41,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.models.motion_autoencoder": ("MotionAutoencoder",),
     "wearcap.systems.mocap_every.manifold": ("MotionManifold",),
     "wearcap.models.point_encoder": ("ObjectNetwork", "PointNeXt"),
-    "wearcap.models.pose_regressor": ("PoseRegressor",),
     "wearcap.models.voxel_autoencoder": ("VoxelAutoencoder",),
-    "wearcap.systems.mocap_every.model": ("LastPoseEstimator", "MLPEstimator", "TwoStageEstimator"),
+    "wearcap.systems.mocap_every.model": ("MLPEstimator", "TwoStageEstimator"),
     "wearcap.systems.ireplica.training": ("ContactDetection",),
     "wearcap.systems.echo.training": ("EchoDiffusion",),
     "wearcap.systems.hmd2.egoview_training": ("EgoView",),
@@ -52,7 +50,6 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.training": ("MotionDiffusion",),
     "wearcap.systems.mocap_every.manifold_training": ("ManifoldTraining",),
     "wearcap.systems.echo.object_training": ("ObjectEncoding",),
-    "wearcap.systems.hmd2.pose_regressor.training": ("PoseRegression",),
     "wearcap.training.schedules": ("warmup_cosine",),
     "wearcap.systems.hmd2.voxel_autoencoder_training": ("VoxelReconstruction",),
     "wearcap.systems.mocap_every.training": ("WatchRegression",),
@@ -62,14 +59,15 @@ TARGETS: dict[str, tuple[str, ...]] = {
 }
 """Classes (and functions that return plain objects) that a model's config may name, by their modules."""
 
-MOVED = {"wearcap.systems.hmd2.point_codes_training": "wearcap.systems.hmd2.voxel_autoencoder_training"}
-"""Modules that files of before name, and where their classes are now."""
+MOVED = {
+    "wearcap.systems.hmd2.point_codes_training.VoxelReconstruction": "wearcap.systems.hmd2.voxel_autoencoder_training.VoxelReconstruction"
+}
+"""Targets that files of before name, and where they are now."""
 RENAMED = {"wearcap.diffusion.levels.LevelMix": {"whole": "fully_observed"}}
 """Settings that files of before have under another name, by target."""
 STRUCK = {"object_in_wrists": False}
 """Settings that went, with the value at which files of before have them and do without."""
 
-_BY_NAME = {f"{module}.{name}": (module, name) for module, names in TARGETS.items() for name in names}
 _TARGET, _PARTIAL = "_target_", "_partial_"
 MAX_VALUES, MAX_TEXT = 10_000, 1000
 """Largest number of values in a model's config, and longest string in it; our checkpoints have at most 150 values."""
@@ -89,8 +87,7 @@ def brought_up_to_date(config: Any) -> None:
     """Give, in place, a model's config today's names of targets and settings, and leave out settings that went and were off."""
     for part in _parts(config):
         if isinstance(target := part.get(_TARGET), str):
-            module, dot, name = target.rpartition(".")
-            target = part[_TARGET] = MOVED.get(module, module) + dot + name
+            target = part[_TARGET] = MOVED.get(target, target)
             for old, new in RENAMED.get(target, {}).items():
                 if old in part:
                     part[new] = part.pop(old)
@@ -123,7 +120,7 @@ def check_config(config: Any, where: str | Path) -> None:
             if _PARTIAL in value and not (isinstance(value[_PARTIAL], bool) and _TARGET in value):
                 raise _refused(f"{_PARTIAL}: {str(value[_PARTIAL])[:80]!r}", where)
             target = value.get(_TARGET)
-            if _TARGET in value and target not in (_BY_NAME if isinstance(target, str) else ()):
+            if _TARGET in value and not (isinstance(target, str) and _is_known(target)):
                 what = f"the model is to be made of {str(target)[:80]!r}, which is no part of wearcap's models"
                 expected = "networks, features and optimisers of wearcap and PyTorch alone"
                 raise WearcapError(what, where=where, expected=expected)
@@ -136,6 +133,11 @@ def check_config(config: Any, where: str | Path) -> None:
             raise _refused(f"{key}: {str(value)[:80]}", where)
         elif isinstance(value, float) and not math.isfinite(value):
             raise _refused(f"{key}: {value}", where)
+
+
+def _is_known(target: str) -> bool:
+    module, _, name = target.rpartition(".")
+    return name in TARGETS.get(module, ())
 
 
 def _refused(what: str, where: str | Path) -> WearcapError:
@@ -177,7 +179,9 @@ def build(config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path
 
 def target_of(name: str) -> Callable[..., Any]:
     """The class or function of a `_target_` of `TARGETS`."""
-    module, attribute = _BY_NAME[name]
+    if not _is_known(name):
+        raise KeyError(name)
+    module, _, attribute = name.rpartition(".")
     return getattr(importlib.import_module(module), attribute)
 
 

@@ -28,7 +28,7 @@ STILL_M = 1e-6
 class Bending:
     """Parameters of eq. 5.2. Raises WearcapError for a rigidity that is not positive or an unknown norm."""
 
-    rigidity: float = 10.0
+    rigidity: float
     """λ: metres of the control term per unit of E_tr (rad²/s, or rad for "absolute")."""
     norm: str = "square"
     """Penalty on the difference of heading rates, which eq. 5.1 does not print: ∫ (dα̂/dτ − dα/dτ)² dτ, or ∫ |…| dτ."""

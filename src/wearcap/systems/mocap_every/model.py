@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from wearcap.body.skeleton import FEET
 from wearcap.models.layers import MixingBlock, Normalizer, TemporalBlend, attention_mask
-from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.runtime.graphs import Graph
 
 ENDS_SIZE = 12
@@ -119,39 +118,6 @@ class TwoStageEstimator(WatchEstimator):
         return tokens.unflatten(2, (self.per_token, -1)).flatten(1, 2)
 
 
-class LastPoseEstimator(WatchEstimator):
-    """Baseline after AvatarPoser (Jiang et al. 2022): one encoder predicts the pose of the window's last frame."""
-
-    def __init__(
-        self,
-        feature_size: int,
-        motion_size: int,
-        window: int,
-        width: int,
-        layers: int,
-        heads: int,
-        feedforward: int,
-        dropout: float,
-        frames_per_token: int = 1,
-    ):
-        super().__init__()
-        self.window = window
-        self.regressor = PoseRegressor(
-            feature_size, motion_size + FEET, window, width, layers, heads, feedforward, dropout, frames_per_token
-        )
-        self.motion_normalizer, self.ends_normalizer = Normalizer(motion_size), Normalizer(ENDS_SIZE)
-
-    @property
-    def feature_normalizer(self) -> Normalizer:
-        return self.regressor.feature_normalizer
-
-    def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
-        """Predict the window's last frame from raw features."""
-        valid = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
-        output = self.regressor(features, valid)[:, None]
-        return Estimate(self.motion_normalizer.inverse(output[..., :-FEET]), output[..., -FEET:], None)
-
-
 class MLPEstimator(WatchEstimator):
     """AGRoL's network without its diffusion (Du et al. 2023): one MLP predicts all frames of a window; with `blend` ours."""
 
@@ -179,7 +145,7 @@ class MLPEstimator(WatchEstimator):
         return Estimate(self.motion_normalizer.inverse(motion), logit, None)
 
 
-TrainedEstimator = TwoStageEstimator | LastPoseEstimator | MLPEstimator
+TrainedEstimator = TwoStageEstimator | MLPEstimator
 
 
 class _EstimatorOutput(nn.Module):
