@@ -15,6 +15,7 @@ from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import video_info
 from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.prepare.suits import read_suit
+from wearcap.reading.any_file import below
 from wearcap.recording.recording import CameraStream, Localization, Recording
 from wearcap.sensors.slam_alignment import pose_of
 
@@ -100,9 +101,7 @@ def suit_tasks(source: str | Path, splits: Splits, subject: str, license: str, s
         raise WearcapError("a head camera without its intrinsics", settings.video or settings.camera_poses, fix=fix)
     if missing := [path for path in (*settings.files(), Path(settings.video or source)) if not path.exists()]:
         raise WearcapError("no such file", missing[0])
-    found = [source]
-    if source.is_dir():
-        found = sorted(path for path in source.rglob("*") if ".mvnx" in (part.lower() for part in path.suffixes))
+    found = list(below(source, "MVNX")) if source.is_dir() else [source]
     if not found:
         raise WearcapError("no .mvnx in this folder", source, "takes that MVN exported (plain, .gz or .xz)")
     if len(found) > 1 and (settings.files() or settings.video):

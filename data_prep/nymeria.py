@@ -4,9 +4,10 @@ from functools import partial
 from pathlib import Path
 
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.nymeria import head_vrs, is_nymeria, read_metadata, read_nymeria
+from wearcap.io.datasets.nymeria import head_vrs, read_metadata, read_nymeria
 from wearcap.io.devices.aria_mps import mps_files
 from wearcap.prepare.engine import Splits, Task, changed, content_hash, source_folder
+from wearcap.reading.any_file import below
 
 VERSION = 2
 """Version of the conversion, increased when the same source and settings yield another recording."""
@@ -20,7 +21,7 @@ def nymeria_tasks(
     With `camera`, the video of the head's colour camera is written to `output`/videos, for sequences with `data.vrs`.
     """
     source = source_folder(source)
-    folders = sorted(path.parents[1] for path in source.rglob("xdata.npz") if is_nymeria(path.parents[1]))
+    folders = list(below(source, "Nymeria"))
     if not folders:
         raise WearcapError("no sequences", where=source, expected="folders with body/xdata.npz")
     tasks = []
