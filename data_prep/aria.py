@@ -6,7 +6,8 @@ from pathlib import Path
 from wearcap.errors import WearcapError
 from wearcap.io.devices.aria_mps import mps_files, read_mps
 from wearcap.prepare.engine import Splits, Task, changed, content_hash, source_folder
-from wearcap.reading.any_file import below
+from wearcap.reading.any_file import of_name
+from wearcap.reading.kinds import below
 
 VERSION = 2
 """Version of the conversion, increased when the same source and settings yield another recording."""
@@ -15,7 +16,7 @@ VERSION = 2
 def aria_tasks(source: str | Path, splits: Splits, subject: str, fps: float | int, license: str) -> list[Task]:
     """One task per closed-loop trajectory at or below `source`, named after its recording's folder."""
     source = source_folder(source)
-    folders = list(below(source, "MPS"))
+    folders = list(below(source, of_name("MPS")))
     if not folders:
         raise WearcapError("no MPS output", where=source, expected="folders with closed_loop_trajectory.csv")
     tasks = []

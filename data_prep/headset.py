@@ -6,7 +6,8 @@ from data_prep.trajectory import log_task
 from wearcap.errors import WearcapError
 from wearcap.prepare.engine import Splits, Task
 from wearcap.prepare.logs import HeadsetSettings
-from wearcap.reading.any_file import below
+from wearcap.reading.any_file import of_name
+from wearcap.reading.kinds import below
 from wearcap.recording.recording import Recording
 
 VERSION = 1
@@ -24,7 +25,7 @@ def headset_tasks(
     source = Path(source)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
-    found = list(below(source, "headset")) if source.is_dir() else [source]
+    found = list(below(source, of_name("headset"))) if source.is_dir() else [source]
     if not found:
         raise WearcapError("no headset's log in this folder", source, "CSV or JSON with time, head_pos_x, …")
     return [log_task("headset", VERSION, path, _headset, splits, subject, license, settings) for path in found]

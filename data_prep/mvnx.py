@@ -7,15 +7,16 @@ from pathlib import Path
 
 import torch
 
+from data_prep.hps import nominal_mount
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hps import nominal_mount
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.scene_folder import cloud_file, used_files
 from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import video_info
 from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.prepare.suits import read_suit
-from wearcap.reading.any_file import below
+from wearcap.reading.any_file import of_name
+from wearcap.reading.kinds import below
 from wearcap.recording.recording import CameraStream, Localization, Recording
 from wearcap.sensors.slam_alignment import pose_of
 
@@ -101,7 +102,7 @@ def suit_tasks(source: str | Path, splits: Splits, subject: str, license: str, s
         raise WearcapError("a head camera without its intrinsics", settings.video or settings.camera_poses, fix=fix)
     if missing := [path for path in (*settings.files(), Path(settings.video or source)) if not path.exists()]:
         raise WearcapError("no such file", missing[0])
-    found = list(below(source, "MVNX")) if source.is_dir() else [source]
+    found = list(below(source, of_name("MVNX"))) if source.is_dir() else [source]
     if not found:
         raise WearcapError("no .mvnx in this folder", source, "takes that MVN exported (plain, .gz or .xz)")
     if len(found) > 1 and (settings.files() or settings.video):

@@ -3,8 +3,9 @@
 `capture`, `evaluate`, `live`, `view`, `prepare` and the doctor know files and folders by this table: by suffix, then by content.
 """
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import torch
@@ -18,9 +19,6 @@ from wearcap.errors import WearcapError
 from wearcap.io.conventions import CHOICES, DETECTED, Conventions
 from wearcap.io.datasets.adt import is_adt, read_adt
 from wearcap.io.datasets.amass import read_amass
-from wearcap.io.datasets.hps import hps_names, read_hps_sequence
-from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
-from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
 from wearcap.io.devices.aria_mps import is_mps_folder
 from wearcap.io.devices.headset_log import is_headset_session
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
@@ -65,21 +63,34 @@ def load(where: str | Path, how: Conventions = DETECTED) -> Loaded:
     if not path.exists() or (path / MANIFEST).is_file():
         return _load_stored(path)
     kind = kind_of(path)
-    return Loaded(load_recording(path), []) if kind is None else kind.load(path, how)
+    if kind is None or kind.parts:
+        return Loaded(load_recording(path), [])
+    return kind.load(path, how)
+
+
+@cache
+def kinds() -> tuple[Kind, ...]:
+    """All kinds: those of data sets, which packages register as their entry points `wearcap.readers`, then wearcap's own."""
+    return (*(kind for entry in entry_points(group="wearcap.readers") for kind in entry.load()), *KINDS)
 
 
 def kind_of(path: Path) -> Kind | None:
     """Kind of a folder, None for one that is none; or of a file: of several with its suffix by content, and where none knows
     it the last one, whose reader says what is wrong. Raises WearcapError for another suffix."""
     if path.is_dir():
-        return known(path, KINDS)
+        return known(path, kinds())
     possible = possible_kinds(path)
     return known(path, possible) or possible[-1]
 
 
+def of_name(name: str) -> list[Kind]:
+    """Our own kinds of a name: several formats of one kind of device."""
+    return [kind for kind in KINDS if kind.name == name]
+
+
 def possible_kinds(path: Path) -> list[Kind]:
     """Kinds of files with a suffix. Raises WearcapError where there is none, with what to do about usual ones."""
-    if possible := [kind for kind in KINDS if kind.may_be(path)]:
+    if possible := [kind for kind in kinds() if kind.may_be(path)]:
         return possible
     fix = {
         ".c3d": "Markers have no skeleton yet: solve them, and give the BVH.",
@@ -101,10 +112,11 @@ def sources(path: Path, how: Conventions = DETECTED) -> dict[str, Callable[[], L
         return {name: partial(load, path / name, how) for name in RecordingStore.open(path).names()}
     if path.is_file():
         possible_kinds(path)  # raises for a file that nothing reads
-    if not path.is_dir() or known(path, KINDS):
-        return {path.resolve().name if path.is_dir() else path.name: partial(load, path, how)}
-    if names := hps_names(path):
-        return {name: partial(_load_hps, path, name) for name in names}
+    if not path.is_dir():
+        return {path.name: partial(load, path, how)}
+    if kind := known(path, kinds()):
+        parts = kind.parts(path) if kind.parts else [None]
+        return {part or path.resolve().name: partial(kind.load, path, how, part) for part in parts}
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and any(k.may_be(file) for k in MOTIONS)]
     files = files or list(log_files(path))
     if not files:
@@ -114,21 +126,6 @@ def sources(path: Path, how: Conventions = DETECTED) -> dict[str, Callable[[], L
             expected=f"a data set (manifest.json), an MPS, Nymeria, ADT, TotalCapture or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), logs of watches, headsets or trajectories, or files like {', '.join(SUFFIXES)}",
         )
     return {file.relative_to(path).as_posix(): partial(load, file, how) for file in files}
-
-
-def below(path: Path, *names: str) -> Iterator[Path]:
-    """Files and folders of the kinds of these names at or below a path, in order, none of them inside another."""
-    if known(path, [kind for kind in KINDS if kind.name in names]):
-        yield path
-    elif path.is_dir():
-        for each in sorted(path.iterdir()):
-            if each.is_file() or (each.is_dir() and not each.is_symlink()):
-                yield from below(each, *names)
-
-
-def _load_hps(root: Path, name: str) -> Loaded:
-    recording = read_hps_sequence(root, name)
-    return Loaded(recording, check_files(recording, root))
 
 
 def _load_stored(path: Path) -> Loaded:
@@ -154,12 +151,6 @@ def _read_motion_folder(folder: Path) -> Recording:
     return Recording(folder.resolve().name, motion=motion, skeleton=motion.skeleton)
 
 
-def _read_totalcapture(folder: Path) -> Recording:
-    """A sequence in Vicon's skeleton; where the sensors are mounted is not known."""
-    found = read_totalcapture(totalcapture_files(folder)[0])
-    return Recording(folder.resolve().name, motion=found.motion, imu=found.imu, source="TotalCapture")
-
-
 def _read_points(path: Path) -> Recording:
     points = (read_pcd if ".pcd" in path.suffixes else read_ply)(path).points
     return Recording(path.name, points=PointCloud(torch.from_numpy(points).float()))
@@ -169,7 +160,6 @@ MOTIONS = (
     Kind("AMC", _load_foreign, (".amc",), stated=("unit", "up")),
     Kind("BVH", _load_foreign, (".bvh",), stated=("unit", "up")),
     Kind("MVNX", read_suit, (".mvnx",)),
-    Kind("Nymeria's suit", lambda path: read_xdata(path)[0], (".npz",), lambda path: path.name == "xdata.npz"),
     Kind(
         "trajectory",
         load_trajectory,
@@ -182,10 +172,8 @@ MOTIONS = (
 )
 """Files that may hold a body's motion."""
 KINDS = (
-    Kind("Nymeria", read_nymeria, knows=is_nymeria),
     Kind("MPS", load_mps, knows=is_mps_folder),
     Kind("ADT", read_adt, knows=is_adt),
-    Kind("TotalCapture", _read_totalcapture, knows=is_totalcapture),
     Kind("place", read_place, knows=is_place),
     Kind("motion", _read_motion_folder, knows=motion_files),
     Kind("headset", load_headset, knows=is_headset_session, stated=OF_HEADSETS),
@@ -199,5 +187,5 @@ KINDS = (
     Kind("environment", read_environment_file, (".json",)),
     Kind("points", _read_points, (".ply", ".pcd")),
 )
-"""All kinds; the first that knows a path is the one."""
+"""The kinds that wearcap itself knows; the first that knows a path is the one."""
 SUFFIXES = tuple(dict.fromkeys(suffix for kind in KINDS for suffix in kind.suffixes))
