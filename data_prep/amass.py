@@ -7,7 +7,7 @@ from pathlib import Path
 
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.conventions import AUTO
-from wearcap.io.datasets.amass import read_amass
+from wearcap.io.formats.amass import read_amass
 from wearcap.prepare.engine import Splits, Task, content_hash, source_folder
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording

@@ -9,7 +9,7 @@ frame. Its folders are found by what their names contain (`hps_smpl`, `hps_betas
 The suit's pose is text written by Unity (`*_pose.txt`, `*_trans.txt`), whose world is left-handed (x right, y up, z
 forward) and turns by Euler angles "ZXY": first about z, then x, then y, all about fixed axes, in degrees. With x flipped
 it is SMPL's (right-handed): rotations about x keep their sign, those about y and z change it, so
-R = Ry(-y) Rx(x) Rz(-z). SMPL's axes are then converted as in wearcap.io.datasets.amass; here the world's axes are, too, for
+R = Ry(-y) Rx(x) Rz(-z). SMPL's axes are then converted as in wearcap.io.formats.amass; here the world's axes are, too, for
 Unity's world is y up.
 """
 

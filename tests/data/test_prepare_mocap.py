@@ -22,7 +22,7 @@ from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.verbs import help_of
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.amass import write_amass
+from wearcap.io.formats.amass import write_amass
 from wearcap.metrics.gait import knee_cycles, normal_knee_deg
 from wearcap.prepare import Splits, check_recording
 from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches

@@ -18,7 +18,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate, resample
-from wearcap.io.datasets.adt import read_adt
+from wearcap.io.devices.aria_adt import read_adt
 from wearcap.io.devices.aria_mps import read_closed_loop, read_mps
 from wearcap.metrics.scores import cue_errors_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder

@@ -17,7 +17,7 @@ from own_bvh import read_bvh
 from wearcap.body.skeletons import smplh52
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.datasets.amass import read_amass, write_amass
+from wearcap.io.formats.amass import read_amass, write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.camera_json import write_camera
 from wearcap.io.formats.motion_npz import read_motion, write_motion

@@ -17,10 +17,10 @@ from wearcap.checks.places import is_map, is_place, read_environment_file, read_
 from wearcap.checks.report import Check
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import CHOICES, DETECTED, Conventions
-from wearcap.io.datasets.adt import is_adt, read_adt
-from wearcap.io.datasets.amass import read_amass
+from wearcap.io.devices.aria_adt import is_adt, read_adt
 from wearcap.io.devices.aria_mps import is_mps_folder
 from wearcap.io.devices.headset_log import is_headset_session
+from wearcap.io.formats.amass import read_amass
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
