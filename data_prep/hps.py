@@ -37,6 +37,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rotation import about_axis
+from wearcap.io.devices.axes import CAMERA
 from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.navvis import CLOUD, read_pose
 from wearcap.io.formats.smpl import A, shape_from_betas, smpl_motion
@@ -174,7 +175,7 @@ def resampled_localization(localization: Localization, fps: float | int) -> Loca
 
 def nominal_mount() -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """(R_head_cam, t_head_cam) of an upright, forward-looking camera on the forehead (assumed: it is not measured)."""
-    return torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), torch.tensor([0.12, 0.0, 0.12])
+    return CAMERA, torch.tensor([0.12, 0.0, 0.12])
 
 
 _HIERARCHY = (

@@ -26,6 +26,7 @@ from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
+from wearcap.io.devices.axes import WORLDS
 from wearcap.io.formats.poses import NORM_TOLERANCE
 from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23, without_glitches
@@ -57,8 +58,7 @@ _RIGID_M = 0.02
 """Largest deviation (root mean square) of a joint's place in its parent's axes."""
 _TILT = 0.2
 """Largest share of gravity that may be left on average when it is taken off."""
-_WORLD_VICON = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""R_world_vicon: z up instead of y."""
+_WORLD_VICON = WORLDS["y"]
 _KINDS = {
     "positions": r"gt_skel_gbl_pos\.txt",
     "orientations": r"gt_skel_gbl_ori\.txt",
