@@ -24,7 +24,7 @@ from wearcap.io.formats.amass import read_amass
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.trajectory import trajectory_file
+from wearcap.io.formats.trajectory import trajectory_file, trajectory_format
 from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.prepare.suits import read_suit
 from wearcap.reading.kinds import Kind, Loaded, known
@@ -183,7 +183,7 @@ KINDS = (
     Kind("map", read_map, (".safetensors",), is_map),
     Kind("recording", lambda path: RecordingFile(path).load(), (".safetensors",)),
     *LOGS,
-    Kind("trajectory", load_trajectory, (".bin",), stated=OF_TRAJECTORIES),
+    Kind("trajectory", load_trajectory, (".bin",), trajectory_format, OF_TRAJECTORIES),
     Kind("environment", read_environment_file, (".json",)),
     Kind("points", _read_points, (".ply", ".pcd")),
 )
