@@ -34,7 +34,7 @@ def test_the_page_tells_what_a_source_needs(source):
 def test_every_file_serves_a_source_and_every_list_has_one():
     configs = {name: path.read_text(encoding="utf-8") for name, path in sources().items()}
     used = {file for text in configs.values() for file in re.findall(r"_target_: data_prep\.(\w+)\.", text)}
-    by_others = {"__init__", "nymeria_alignment", "one_object", "ui_prmd"}
+    by_others = {"__init__", "adt", "nymeria_alignment", "one_object", "ui_prmd"}
     files = {path.stem for path in DATA_PREP.glob("*.py")} - by_others
     assert files <= used
     assert all(f"data_prep.{name}." in configs[name] for name in files & configs.keys())

@@ -40,12 +40,12 @@ import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
 import marker_person  # noqa: E402
 import short_walk  # noqa: E402
-from data_prep import behave, egohoi, hcontact, hps, mocap_every_folder, nymeria, omomo, totalcapture, ui_prmd  # noqa: E402
+from data_prep import adt, behave, egohoi, hcontact, hps, mocap_every_folder, nymeria, omomo, totalcapture, ui_prmd  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.boundary import arrays, pickles, texts  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
-from wearcap.io.devices import aria_adt, aria_mps, headset_log, headset_tables, watch_log  # noqa: E402
+from wearcap.io.devices import aria_mps, headset_log, headset_tables, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     amass,
     asf_amc,
@@ -294,8 +294,8 @@ def _foreign_walk(path: Path) -> None:
 
 
 READERS: dict[str, Reader] = {
-    "adt_skeleton": made("s.json", test_adt.skeleton_file, aria_adt.read_skeleton),
-    "adt_objects": Reader(_adt_objects, aria_adt.read_moving_objects),
+    "adt_skeleton": made("s.json", test_adt.skeleton_file, adt.read_skeleton),
+    "adt_objects": Reader(_adt_objects, adt.read_moving_objects),
     "amass": made("a.npz", _amass, amass.read_amass),
     "aria_closed_loop": made(
         "a.csv", lambda path: test_aria_mps.write(path, test_aria_mps.rows(12)), aria_mps.read_closed_loop

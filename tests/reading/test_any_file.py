@@ -80,7 +80,7 @@ def test_data_sets_register_their_kinds():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     rows = [pkgutil.resolve_name(name) for name in project["entry-points"]["wearcap.readers"].values()]
     names = [kind.name for row in rows for kind in row]
-    assert {"HPS", "Nymeria", "TotalCapture"} <= set(names)
+    assert {"ADT", "HPS", "Nymeria", "TotalCapture"} <= set(names)
     assert [kind.name for kind in kinds()][: len(names)] == names
 
 

@@ -17,7 +17,6 @@ from wearcap.checks.places import is_map, is_place, read_environment_file, read_
 from wearcap.checks.report import Check
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import CHOICES, DETECTED, Conventions
-from wearcap.io.devices.aria_adt import is_adt, read_adt
 from wearcap.io.devices.aria_mps import is_mps_folder
 from wearcap.io.devices.headset_log import is_headset_session
 from wearcap.io.formats.amass import read_amass
@@ -173,7 +172,6 @@ MOTIONS = (
 """Files that may hold a body's motion."""
 KINDS = (
     Kind("MPS", load_mps, knows=is_mps_folder),
-    Kind("ADT", read_adt, knows=is_adt),
     Kind("place", read_place, knows=is_place),
     Kind("motion", _read_motion_folder, knows=motion_files),
     Kind("headset", load_headset, knows=is_headset_session, stated=OF_HEADSETS),

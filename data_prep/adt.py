@@ -17,6 +17,7 @@ from wearcap.io.devices.aria_mps import head_stream, read_closed_loop
 from wearcap.io.devices.axes import WORLDS
 from wearcap.io.formats.csv_table import read_columns
 from wearcap.io.formats.poses import check_finite, check_rising, checked_trajectory
+from wearcap.reading.kinds import Kind
 from wearcap.recording import Cue, Recording
 
 _BODY = {
@@ -104,3 +105,7 @@ def read_moving_objects(folder: str | Path, up: str = "y") -> dict[str, Trajecto
         if about.get("motion_type") == "dynamic" and not timeless:
             found[str(about.get("instance_name", name))] = Trajectory(track.timestamps, T_world_obj.R, T_world_obj.t)
     return found
+
+
+KINDS = (Kind("ADT", read_adt, knows=is_adt),)
+"""How `wearcap.read` knows the data set, which has no true body to prepare."""
