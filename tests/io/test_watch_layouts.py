@@ -360,6 +360,14 @@ def rows_of(path: Path) -> tuple[str, list[str]]:
     return header, rows
 
 
+def test_a_log_without_a_number_lacks_everything(tmp_path):
+    header, rows = rows_of(another_watch(tmp_path))
+    lost = [",".join([row.partition(",")[0], *["nan"] * row.count(",")]) for row in rows]
+    (tmp_path / "lost.csv").write_text("\n".join([header, *lost]) + "\n")
+    with pytest.raises(WearcapError, match="a motion log without attitude and acceleration"):
+        read_watch(tmp_path / "lost.csv", "left_wrist")
+
+
 def test_unsorted_and_repeated_rows_are_mended_and_counted(tmp_path):
     plain = another_watch(tmp_path)
     header, rows = rows_of(plain)

@@ -375,7 +375,7 @@ def _in_order(seconds: np.ndarray, parts: dict[str, np.ndarray], names: dict[str
 
     Raises WearcapError for fewer than 2 rows or 20 a second, and for two recordings in one file.
     """
-    values = np.concatenate([*parts.values()], 1)
+    values = np.concatenate([np.zeros((len(seconds), 0)), *parts.values()], 1)  # all may have been without numbers
     # An attitude is smooth but for its sign; other numbers may jump from row to row.
     smooth = np.abs(parts["quaternion"]) if "quaternion" in parts else values
     whole = np.isfinite(values).all(1)
