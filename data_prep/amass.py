@@ -13,7 +13,7 @@ from data_prep.shared.mocap import MOCAP, About, MocapSettings, mocap_recording
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO
-from wearcap.io.datasets.amass import read_amass
+from wearcap.io.formats.amass import read_amass
 from wearcap.recording.recording import Recording
 
 VERSION = 3

@@ -29,7 +29,7 @@ from wearcap.files import content_hash
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.amass import PELVIS_SMPLH
+from wearcap.io.formats.amass import PELVIS_SMPLH
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import check_rising
 from wearcap.io.formats.smpl import shape_from_betas, smpl_motion

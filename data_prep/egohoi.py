@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from data_prep.hcontact import about_sequence, read_smpl_json
+from data_prep.hps import read_hps_subject, subject_of
 from data_prep.shared.engine import Splits, Task
 from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import read_json
@@ -23,7 +24,6 @@ from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.hps import read_hps_subject, subject_of
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
 from wearcap.io.formats.environment import FILE_NAME, write_environment
 from wearcap.io.formats.ply import read_ply

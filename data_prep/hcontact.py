@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from data_prep.hps import subject_of
 from data_prep.shared.engine import NOTE, Splits, Task
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.boundary.arrays import read_packed_json, require
@@ -22,7 +23,6 @@ from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
-from wearcap.io.datasets.hps import subject_of
 from wearcap.io.formats.contact_labels import LabelClock, read_contact_labels
 from wearcap.io.formats.poses import check_rising
 from wearcap.io.formats.smpl import shape_from_betas, smpl_motion

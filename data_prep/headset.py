@@ -7,8 +7,9 @@ from data_prep.shared.engine import Splits, Task
 from data_prep.trajectory import log_task
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO
-from wearcap.io.devices.headset_log import is_headset_log, is_headset_session
 from wearcap.prepare.logs import HeadsetSettings
+from wearcap.reading.any_file import of_name
+from wearcap.reading.kinds import below
 from wearcap.recording.recording import Recording
 
 VERSION = 1
@@ -42,13 +43,7 @@ def headset_tasks(
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
     settings = HeadsetSettings(unit, axes, quaternion, hands, time_unit, T_head_device, height)
-    kinds = (".csv", ".tsv", ".json", ".jsonl", ".txt", ".bsor")
-    found = [source]
-    if source.is_dir() and not is_headset_session(source):
-        there = sorted(source.rglob("*"))
-        found = [path for path in there if path.is_dir() and path.name != "trackers" and is_headset_session(path)]
-        files = [path for path in there if path.is_file() and set(path.suffixes) & set(kinds)]
-        found += [path for path in files if not set(path.parents) & set(found) and is_headset_log(path)]
+    found = list(below(source, of_name("headset"))) if source.is_dir() else [source]
     if not found:
         raise WearcapError("no headset's log in this folder", source, "CSV or JSON with time, head_pos_x, …")
     return [log_task("headset", VERSION, path, _headset, splits, subject, license, settings) for path in found]

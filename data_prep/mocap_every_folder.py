@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from data_prep.hps import nominal_mount
 from data_prep.shared.engine import Splits, Task, source_folder
 from wearcap.body.skeleton import WRISTS
 from wearcap.boundary.arrays import array_of, require
@@ -25,7 +26,6 @@ from wearcap.files import content_hash
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.hps import nominal_mount
 from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory

@@ -7,15 +7,17 @@ from pathlib import Path
 
 import torch
 
+from data_prep.hps import nominal_mount
 from data_prep.shared.engine import Splits, Task
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
-from wearcap.io.datasets.hps import nominal_mount
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.scene_folder import cloud_file, used_files
 from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import video_info
 from wearcap.prepare.suits import read_suit
+from wearcap.reading.any_file import of_name
+from wearcap.reading.kinds import below
 from wearcap.recording.recording import CameraStream, Localization, Recording
 from wearcap.sensors.slam_alignment import pose_of
 
@@ -111,9 +113,7 @@ def mvnx_tasks(
         raise WearcapError("a head camera without its intrinsics", settings.video or settings.camera_poses, fix=fix)
     if missing := [path for path in (*settings.files(), Path(settings.video or source)) if not path.exists()]:
         raise WearcapError("no such file", missing[0])
-    found = [source]
-    if source.is_dir():
-        found = sorted(path for path in source.rglob("*") if ".mvnx" in (part.lower() for part in path.suffixes))
+    found = list(below(source, of_name("MVNX"))) if source.is_dir() else [source]
     if not found:
         raise WearcapError("no .mvnx in this folder", source, "takes that MVN exported (plain, .gz or .xz)")
     if len(found) > 1 and (settings.files() or settings.video):

@@ -28,7 +28,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.amass import PELVIS_SMPLX
+from wearcap.io.formats.amass import PELVIS_SMPLX
 from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.smpl import shape_from_arrays, smpl_motion
 from wearcap.io.formats.wavefront import read_obj

@@ -10,9 +10,9 @@ from data_prep.shared.engine import Splits, Task
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO
-from wearcap.io.devices.aria_mps import is_mps_folder
-from wearcap.io.formats.trajectory import trajectory_file, trajectory_format
 from wearcap.prepare.logs import TrajectorySettings, log_name, read_path
+from wearcap.reading.any_file import of_name
+from wearcap.reading.kinds import known
 from wearcap.recording.recording import Recording
 
 VERSION = 2
@@ -59,11 +59,9 @@ def trajectory_tasks(
     settings = TrajectorySettings(*path, *evidence, video, camera, video_start_s, *clean)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
-    if source.is_dir() and not is_mps_folder(source) and trajectory_file(source) is None:
-        found = [path for path in sorted(source.iterdir()) if path.is_dir() and trajectory_file(path)]
-        found += [path for path in sorted(source.iterdir()) if path.is_file() and trajectory_format(path)]
-    else:
-        found = [source]
+    kinds, found = [*of_name("trajectory"), *of_name("MPS")], [source]
+    if source.is_dir() and not known(source, kinds):
+        found = [path for path in sorted(source.iterdir()) if known(path, kinds)]
     if not found:
         raise WearcapError("no trajectory in this folder", source, "a file that wearcap doctor knows as one")
     if len(found) > 1 and (settings.files() or settings.video):

@@ -40,14 +40,14 @@ import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
 import marker_person  # noqa: E402
 import short_walk  # noqa: E402
-from data_prep import behave, egohoi, hcontact, mocap_every_folder, omomo, ui_prmd  # noqa: E402
+from data_prep import adt, behave, egohoi, hcontact, hps, mocap_every_folder, nymeria, omomo, totalcapture, ui_prmd  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.boundary import arrays, pickles, texts  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
-from wearcap.io.datasets import adt, amass, hps, nymeria, totalcapture  # noqa: E402
 from wearcap.io.devices import aria_mps, headset_log, headset_tables, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
+    amass,
     asf_amc,
     bsor,
     bvh,
@@ -61,6 +61,7 @@ from wearcap.io.formats import (  # noqa: E402
     hand_detections,
     motion_npz,
     mvnx,
+    navvis,
     ocamcalib,
     pcd,
     ply,
@@ -354,7 +355,7 @@ READERS: dict[str, Reader] = {
         hps.read_hps_localization,
     ),
     "hps_cameras": one("c.json", json.dumps(hps_files.CAMERA), hps.read_hps_cameras),
-    "hps_scene": Reader(hps_files.write_scan, hps.read_hps_scene),
+    "hps_scene": Reader(hps_files.write_scan, navvis.read_navvis_scan),
     "hps_sequence": Reader(
         lambda folder: hps_files.write_hps(folder, frames=FRAMES),
         lambda folder: hps.read_hps_sequence(folder, hps_files.NAME),

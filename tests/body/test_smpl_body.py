@@ -14,7 +14,7 @@ from wearcap.cli.capture import _on_smpl
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.datasets.amass import write_amass
+from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.recording import Recording

@@ -24,7 +24,7 @@ from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.verbs import help_of
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.amass import write_amass
+from wearcap.io.formats.amass import write_amass
 from wearcap.metrics.gait import knee_cycles, normal_knee_deg
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from ocam_files import lens, xml_of
 
+from data_prep.hps import PELVIS_SMPL, UNITY_JOINTS, nominal_mount
 from wearcap.body.skeletons import smpl24
 from wearcap.geometry import rotation
-from wearcap.io.datasets.hps import PELVIS_SMPL, UNITY_JOINTS, nominal_mount
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.smpl import A
 from wearcap.recording import Motion

@@ -12,7 +12,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import smplh52, smplx22
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.amass import PELVIS_SMPLH
+from wearcap.io.formats.amass import PELVIS_SMPLH
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.smpl import A
 from wearcap.recording import Motion

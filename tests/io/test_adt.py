@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from data_prep.adt import is_adt, read_adt, read_moving_objects, read_skeleton
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.adt import is_adt, read_adt, read_moving_objects, read_skeleton
 
 
 def skeleton_file(path, joints=51, frames=3):

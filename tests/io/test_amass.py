@@ -14,7 +14,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import smpl24, smplh52, smplx22
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.amass import PELVIS_SMPLH, read_amass, write_amass
+from wearcap.io.formats.amass import PELVIS_SMPLH, read_amass, write_amass
 from wearcap.recording import Motion
 
 random = np.random.default_rng(5)

@@ -18,8 +18,8 @@ from wearcap.io.devices.aria_mps import (
     read_mps,
     read_mps_points,
     read_points,
-    turn_up,
 )
+from wearcap.io.devices.axes import WORLDS
 from wearcap.io.formats import csv_table
 
 HEADER = (
@@ -131,7 +131,7 @@ def test_y_up_world_is_turned(tmp_path):
     read = read_closed_loop(write(tmp_path / "t.csv", table))
     assert read.up == "y"
     assert read[0].t_world_body[0].tolist() == pytest.approx([0.0, -0.25, 1.6], abs=1e-6)
-    assert torch.linalg.det(turn_up("y")) == pytest.approx(1.0)
+    assert torch.linalg.det(WORLDS["y"]) == pytest.approx(1.0)
 
 
 def test_points_are_kept_by_their_certainty(tmp_path):

@@ -87,10 +87,10 @@ def test_repeated_and_unsorted_rows(tmp_path):
     head, *rows = path.read_text().splitlines()
     moved = rows[0].replace(",0.", ",0.0", 1)
     write(path, "\n".join([head, rows[0], moved, moved, *rows[1:]]))
-    assert "head: 2 rows repeat a time and were dropped" in compare(path)[2]
+    assert "head: 2 rows that repeat a time are left out" in compare(path)[2]
     swapped = [rows[k] for k in (1, 0, *range(2, 100), 101, 100, *range(102, len(rows)))]
     write(path, "\n".join([head, *swapped]))
-    assert "head: 2 rows lay before their predecessors and were sorted" in compare(path)[2]
+    assert "head: 2 rows are earlier than the ones before them: all are sorted by time" in compare(path)[2]
 
 
 def test_two_recordings_in_one_table(tmp_path):

@@ -13,10 +13,7 @@ import torch
 from hps_files import FRAMES, NAME, same_motion, write_smpl, write_unity
 from hypothesis import given
 
-from hostile import fuzz, mutated, mutated_bytes
-from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
-from wearcap.io.datasets.hps import (
+from data_prep.hps import (
     read_hps_cameras,
     read_hps_localization,
     read_hps_motion,
@@ -26,6 +23,9 @@ from wearcap.io.datasets.hps import (
     resampled_localization,
     rotations_from_unity,
 )
+from hostile import fuzz, mutated, mutated_bytes
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.recording import Localization
 
 # Single files ------------------------------------------------------------------------------------------------------

@@ -12,18 +12,19 @@ import torch
 from hps_files import CAM_START, IMU_START, NAME, SCAN, same_motion, write_hps, write_scan
 from test_mvnx import mvnx, sample
 
+from data_prep.hps import _scan_name, hps_names, read_hps_sequence, subject_of
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.hps import _scan_name, hps_names, is_hps_scene, read_hps_scene, read_hps_sequence, subject_of
+from wearcap.io.formats.navvis import is_navvis_scan, read_navvis_scan
 
 # Scans -------------------------------------------------------------------------------------------------------------
 
 
 def test_scan(tmp_path):
     write_scan(tmp_path)
-    assert is_hps_scene(tmp_path)
-    cloud, photos = read_hps_scene(tmp_path)
+    assert is_navvis_scan(tmp_path)
+    cloud, photos = read_navvis_scan(tmp_path)
     assert cloud == tmp_path / "pointcloud.ply"
     assert [photo.file.name for photo in photos] == [f"0000{f}-cam{k}.jpg" for f in (0, 1) for k in (0, 1)]
     assert photos[0].camera.model == "ocam"
@@ -59,13 +60,13 @@ def test_damaged_scan(damage, message, tmp_path):
     write_scan(tmp_path)
     damage(tmp_path)
     with pytest.raises(WearcapError, match=message):
-        read_hps_scene(tmp_path)
+        read_navvis_scan(tmp_path)
 
 
 def test_invalid_frames_are_left_out(tmp_path):
     write_scan(tmp_path)
     rewritten(tmp_path / "info/00000-info.json", lambda info: info | {"valid": "false"})
-    assert len(read_hps_scene(tmp_path)[1]) == 2
+    assert len(read_navvis_scan(tmp_path)[1]) == 2
 
 
 # Sequences ---------------------------------------------------------------------------------------------------------

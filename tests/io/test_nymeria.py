@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from data_prep.nymeria import is_nymeria, read_nymeria, read_xdata
+from data_prep.nymeria_alignment import align_head, clock_offset
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.devices.aria_mps import R_CPF_DEVICE, T_HEAD_DEVICE, nominal_T_aria_cpf
-from wearcap.io.devices.head_alignment import align_head, clock_offset
 
 HZ = 240
 OFFSET_S = -812.345

@@ -14,7 +14,7 @@ from data_prep.omomo import omomo_take, read_omomo
 from hostile import fuzz, mutated_bytes
 from wearcap.body.skeletons import smplx22
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.amass import PELVIS_SMPLX
+from wearcap.io.formats.amass import PELVIS_SMPLX
 
 
 def take_of(root, fps=30.0):

@@ -7,12 +7,7 @@ import torch
 from hypothesis import given
 from totalcapture_files import vicon, write_totalcapture
 
-from hostile import fuzz, mutated
-from wearcap.apps.doctor import examine
-from wearcap.cli.main import run_verb
-from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
-from wearcap.io.datasets.totalcapture import (
+from data_prep.totalcapture import (
     PARENTS,
     SENSORS,
     is_totalcapture,
@@ -22,6 +17,11 @@ from wearcap.io.datasets.totalcapture import (
     read_vicon,
     totalcapture_files,
 )
+from hostile import fuzz, mutated
+from wearcap.apps.doctor import examine
+from wearcap.cli.main import run_verb
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.recording.store import RecordingStore
 from wearcap.sensors.watches import watches_at
 

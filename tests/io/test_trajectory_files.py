@@ -199,7 +199,7 @@ def test_rows_are_sorted_and_what_repeats_or_holds_no_pose_is_counted(tmp_path):
     mixed = [*rows[:50], *rows[40:60], *reversed(rows[60:80]), *lost, *rows[80:]]
     found = read_trajectory_file(short_walk.lines(tmp_path / "t.txt", mixed))
     assert max(short_walk.apart(found.trajectory, time, R, t)) < 1e-3
-    assert [note.split()[0] for note in found.notes] == ["2", "10", "20"], found.notes
+    assert [note.split()[0] for note in found.notes] == ["2", "20", "10"], found.notes
 
 
 def test_a_map_s_coordinates_keep_their_precision_and_their_origin(tmp_path):

@@ -267,7 +267,7 @@ def test_two_recordings_in_one_file_are_not_mixed(tmp_path):
         np.concatenate([R, R]),
         np.concatenate([t, t + np.array([3.0, 1.0, 0.0])]),
     )
-    with pytest.raises(WearcapError, match=r"times start again at line 241, .*cut it there"):
+    with pytest.raises(WearcapError, match=r"line 241: times go back by .*cut it there"):
         read_trajectory(path)
 
 

@@ -262,7 +262,7 @@ def test_a_layout_is_read_as_it_was_written(tmp_path, layout):
 
 def test_lost_packets_are_left_out_and_counted(tmp_path):
     log = read_watch(open_sense(tmp_path), "left_wrist")
-    assert log.notes == ["3 rows without a number in every column: left out"]
+    assert log.notes == ["3 rows without a number in every column are left out"]
     assert len(log.stream.timestamps) == len(seconds()) - 3
     assert log.stream.timestamps.diff().max().item() == pytest.approx(0.03)
 
@@ -360,6 +360,14 @@ def rows_of(path: Path) -> tuple[str, list[str]]:
     return header, rows
 
 
+def test_a_log_without_a_number_lacks_everything(tmp_path):
+    header, rows = rows_of(another_watch(tmp_path))
+    lost = [",".join([row.partition(",")[0], *["nan"] * row.count(",")]) for row in rows]
+    (tmp_path / "lost.csv").write_text("\n".join([header, *lost]) + "\n")
+    with pytest.raises(WearcapError, match="a motion log without attitude and acceleration"):
+        read_watch(tmp_path / "lost.csv", "left_wrist")
+
+
 def test_unsorted_and_repeated_rows_are_mended_and_counted(tmp_path):
     plain = another_watch(tmp_path)
     header, rows = rows_of(plain)
@@ -369,10 +377,9 @@ def test_unsorted_and_repeated_rows_are_mended_and_counted(tmp_path):
     path = tmp_path / "mended.csv"
     path.write_text("\n".join([header, *mended]) + "\n")
     log = read_watch(path, "left_wrist")
-    assert [note.partition(":")[0] for note in log.notes] == [
-        "42 rows out of order",
-        "40 rows repeated",
-        "1 rows with other values at the time of another",
+    assert log.notes == [
+        "2 rows are earlier than the ones before them: all are sorted by time",
+        "41 rows that repeat a time are left out, 1 of them with other values",
     ]
     np.testing.assert_array_equal(log.stream.timestamps, truth.timestamps)
     np.testing.assert_array_equal(log.stream.R_world_imu, truth.R_world_imu)
@@ -382,14 +389,16 @@ def test_unsorted_and_repeated_rows_are_mended_and_counted(tmp_path):
 def test_two_recordings_in_one_file_are_not_mixed(tmp_path):
     header, rows = rows_of(back_and_milliseconds(tmp_path))
     path = tmp_path / "two.csv"
-    shifted = [f"{float(row.partition(',')[0]) + 3.0},{row.partition(',')[2]}" for row in rows]
-    for second in (shifted, [*rows[400:], *rows[:400]]):
-        path.write_text("\n".join([header, *rows, *second]) + "\n")
-        if second is shifted:
-            with pytest.raises(WearcapError, match="clock goes back by 1[0-9.]+ s.*cut it there"):
-                read_watch(path, "left_wrist")
-        else:
-            assert read_watch(path, "left_wrist").notes[-1] == f"{len(rows)} rows repeated: left out"
+    for late_ms in (0.0, 3.0):  # the same clock, of which one row in two is a repeat, and another one
+        later = [
+            f"{float(row.partition(',')[0]) + late_ms},{other.partition(',')[2]}"
+            for row, other in zip(rows, [*rows[300:], *rows[:300]])
+        ]
+        path.write_text("\n".join([header, *rows, *later]) + "\n")
+        with pytest.raises(WearcapError, match=r"row 1201: times go back by 1[0-9.]+ s.*cut it there"):
+            read_watch(path, "left_wrist")
+    path.write_text("\n".join([header, *rows, *rows[400:], *rows[:400]]) + "\n")
+    assert read_watch(path, "left_wrist").notes[-1] == f"{len(rows)} rows that repeat a time are left out"
 
 
 def test_a_turn_rate_of_unknown_unit_is_left_out(tmp_path):
@@ -418,7 +427,7 @@ def test_one_watch_in_different_clothes(real_data, name):
     """The same seconds of one watch's log, as several apps and languages write them."""
     plain = np.genfromtxt(real_data / "field/C_watch_repeated_rows_left.csv", delimiter=",", names=True)[::2]
     log = read_watch(real_data / "field" / f"{name}.csv", "left_wrist")
-    assert log.notes == (["749 rows repeated: left out"] if name.startswith("C") else [])
+    assert log.notes == (["749 rows that repeat a time are left out"] if name.startswith("C") else [])
     count = len(plain) if name.startswith("C") else 700
     stream = log.stream
     np.testing.assert_allclose(stream.timestamps[:count].diff(), np.diff(plain["seconds_elapsed"][:count]), atol=2e-3)

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from data_prep.totalcapture import INCH_M, PARENTS, SENSORS
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
-from wearcap.io.datasets.totalcapture import INCH_M, PARENTS, SENSORS
 from wearcap.sensors.imu import acceleration
 
 OFFSETS = {

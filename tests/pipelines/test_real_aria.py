@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from data_prep.adt import read_adt
 from small_hmd2 import hmd2_of
 from wearcap.apps.doctor import examine
 from wearcap.apps.viewer.picture import contact_sheet, draw_head_path
@@ -18,7 +19,6 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate, resample
-from wearcap.io.datasets.adt import read_adt
 from wearcap.io.devices.aria_mps import read_closed_loop, read_mps
 from wearcap.metrics.scores import cue_errors_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder

@@ -1,6 +1,8 @@
 """Any file is a recording: files of every kind in, a capture of what they hold out, and one clear line for the rest."""
 
+import pkgutil
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,11 +17,12 @@ from own_bvh import read_bvh
 from wearcap.body.skeletons import smplh52
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.datasets.amass import read_amass, write_amass
+from wearcap.io.formats.amass import read_amass, write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.camera_json import write_camera
 from wearcap.io.formats.motion_npz import read_motion, write_motion
 from wearcap.reading import read
+from wearcap.reading.any_file import kinds
 from wearcap.recording import RecordingStore
 from wearcap_testing import recording_of, swaying_motion
 
@@ -70,6 +73,15 @@ def test_a_data_set_s_recordings_are_found_as_before(tmp_path):
     RecordingStore(tmp_path).add(recording_of(swaying_motion(60), "only"), split="train", config_hash="")
     for where in (tmp_path, tmp_path / "only", tmp_path / "recordings" / "only.safetensors"):
         assert read(where).name == "only"
+
+
+def test_data_sets_register_their_kinds():
+    """Where this fails though the file is right, wearcap was installed before it said so: install it again."""
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    rows = [pkgutil.resolve_name(name) for name in project["entry-points"]["wearcap.readers"].values()]
+    names = [kind.name for row in rows for kind in row]
+    assert {"ADT", "HPS", "Nymeria", "TotalCapture"} <= set(names)
+    assert [kind.name for kind in kinds()][: len(names)] == names
 
 
 def test_other_files_get_one_line(tmp_path):

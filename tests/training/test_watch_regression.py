@@ -16,7 +16,7 @@ from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import compose
 from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.amass import read_amass
+from wearcap.io.formats.amass import read_amass
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
 from wearcap.systems.mocap_every.features import ENDS, WatchFeatures

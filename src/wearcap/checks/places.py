@@ -12,11 +12,11 @@ from wearcap.checks.report import Check, Finding, refusal
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import face_normals, random_points
 from wearcap.geometry.triangle_distance import TriangleIndex
-from wearcap.io.datasets.hps import CLOUD, is_hps_scene, read_hps_scene
 from wearcap.io.formats.camera_json import PHOTOS_FILE as PHOTOS
 from wearcap.io.formats.camera_json import read_photos
 from wearcap.io.formats.environment import FILE_NAME as ENVIRONMENT
 from wearcap.io.formats.environment import read_environment
+from wearcap.io.formats.navvis import CLOUD, is_navvis_scan, read_navvis_scan
 from wearcap.io.formats.scene_folder import read_scan
 from wearcap.io.formats.video import open_image
 from wearcap.localization.visual_map import MAP, VisualMap
@@ -46,14 +46,14 @@ _POINTS = 50_000
 
 def is_place(folder: Path) -> bool:
     """Whether a folder holds an environment, or a scan with photos: wearcap's (photos.json) or NavVis' (sensor_frame.xml)."""
-    return any((folder / file).is_file() for file in (ENVIRONMENT, PHOTOS, CLOUD)) or is_hps_scene(folder)
+    return any((folder / file).is_file() for file in (ENVIRONMENT, PHOTOS, CLOUD)) or is_navvis_scan(folder)
 
 
 def read_place(folder: Path) -> tuple[Recording, list[Finding]]:
     """A scan as points, with all findings about scan, photos and environment, including errors of reading them."""
     findings: list[Finding] = []
     scan, photos = None, None
-    if (folder / CLOUD).is_file() or (folder / PHOTOS).is_file() or is_hps_scene(folder):
+    if (folder / CLOUD).is_file() or (folder / PHOTOS).is_file() or is_navvis_scan(folder):
         try:
             scan = read_scan(folder / CLOUD)
             findings += _check_scan(scan)
@@ -61,9 +61,9 @@ def read_place(folder: Path) -> tuple[Recording, list[Finding]]:
             fix = "Export the scene's cloud there."
             missing = Check("scan").error("the scan is missing", str(folder / CLOUD), fix)
             findings.append(refusal(error, "scan") if (folder / CLOUD).is_file() else missing)
-        navvis = is_hps_scene(folder) and not (folder / PHOTOS).is_file()
+        navvis = is_navvis_scan(folder) and not (folder / PHOTOS).is_file()
         try:
-            photos = read_hps_scene(folder)[1] if navvis else read_photos(folder)
+            photos = read_navvis_scan(folder)[1] if navvis else read_photos(folder)
             check = Check("photos")
             missing = [photo.file.name for photo in photos if not photo.file.is_file()]
             if not photos:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from wearcap.checks.report import Check, Finding, has_error
 from wearcap.geometry import rotation
+from wearcap.geometry.correlation import best_shift, correlate_shifts
 from wearcap.geometry.trajectory import Trajectory, interpolate, linear_velocity
-from wearcap.io.devices.head_alignment import best_shift, correlate_shifts
 from wearcap.sensors.imu import acceleration
 
 LAG_RATE_HZ = 200.0

@@ -28,7 +28,7 @@ from wearcap.cli.conf import hydra_application, load_pipeline, run_application, 
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.io.datasets.amass import write_amass
+from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion

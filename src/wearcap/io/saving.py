@@ -9,7 +9,7 @@ from wearcap.body.retarget import retarget
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import smplh52
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.amass import write_amass
+from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion

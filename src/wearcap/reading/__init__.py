@@ -1,6 +1,6 @@
 """Whatever a user has, read as a recording.
 
-Open `any_file.py` first: the one table of readers by suffix and content; `kits.py` reads the logs of one session.
+Open `any_file.py` first: the one table of kinds of files and folders (`kinds.py`); `kits.py` reads the logs of one session.
 """
 
 from wearcap.reading.any_file import load, read

@@ -1,9 +1,11 @@
-"""One reader for whatever a user has: `read(path)` returns a Recording, `load(path)` also what its reader found.
+"""The one table of what holds a recording: `read(path)` returns the Recording, `load(path)` also what its reader found.
 
-`capture`, `evaluate`, `live`, `view` and the doctor read by the same table: by suffix, or for logs by content.
+`capture`, `evaluate`, `live`, `view`, `prepare` and the doctor know files and folders by this table: by suffix, then by content.
 """
 
 from collections.abc import Callable
+from functools import cache, partial
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import torch
@@ -12,27 +14,32 @@ from wearcap.boundary.arrays import read_npz
 from wearcap.checks.consistency import check_files
 from wearcap.checks.examine import require_sound
 from wearcap.checks.places import is_map, is_place, read_environment_file, read_map, read_place
-from wearcap.checks.report import Check, Finding
+from wearcap.checks.report import Check
 from wearcap.errors import WearcapError
-from wearcap.io.conventions import DETECTED, Conventions
-from wearcap.io.datasets.adt import is_adt, read_adt
-from wearcap.io.datasets.amass import read_amass
-from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
-from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
+from wearcap.io.conventions import CHOICES, DETECTED, Conventions
 from wearcap.io.devices.aria_mps import is_mps_folder
-from wearcap.io.devices.headset_log import is_headset_log, is_headset_session
+from wearcap.io.devices.headset_log import is_headset_session
+from wearcap.io.formats.amass import read_amass
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.trajectory import trajectory_file, trajectory_format
 from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.prepare.suits import read_suit
-from wearcap.reading.kits import Loaded, is_kit, load_headset, load_kit, load_log, load_mps, load_trajectory
-from wearcap.recording import Motion, PointCloud, Recording, RecordingStore
+from wearcap.reading.kinds import Kind, Loaded, known
+from wearcap.reading.kits import (
+    LOGS,
+    OF_HEADSETS,
+    OF_TRAJECTORIES,
+    is_kit,
+    load_headset,
+    load_kit,
+    load_mps,
+    load_trajectory,
+    log_files,
+)
+from wearcap.recording import PointCloud, Recording, RecordingStore
 from wearcap.recording.store import MANIFEST, RecordingFile, load_recording
-
-PACKED = (".gz", ".xz")
-Read = Callable[[Path, Conventions], Recording | Motion | Loaded]
 
 
 def read(where: str | Path, how: Conventions = DETECTED, check: bool = False) -> Recording:
@@ -54,38 +61,70 @@ def load(where: str | Path, how: Conventions = DETECTED) -> Loaded:
     path = Path(where)
     if not path.exists() or (path / MANIFEST).is_file():
         return _load_stored(path)
+    kind = kind_of(path)
+    if kind is None or kind.parts:
+        return Loaded(load_recording(path), [])
+    return kind.load(path, how)
+
+
+@cache
+def kinds() -> tuple[Kind, ...]:
+    """All kinds: those of data sets, which packages register as their entry points `wearcap.readers`, then wearcap's own."""
+    return (*(kind for entry in entry_points(group="wearcap.readers") for kind in entry.load()), *KINDS)
+
+
+def kind_of(path: Path) -> Kind | None:
+    """Kind of a folder, None for one that is none; or of a file: of several with its suffix by content, and where none knows
+    it the last one, whose reader says what is wrong. Raises WearcapError for another suffix."""
     if path.is_dir():
-        chosen = next((load_folder for is_kind, load_folder in FOLDERS if is_kind(path)), None)
-        if chosen is None:
-            return Loaded(load_recording(path), [])
-    else:
-        kind = kind_of(path)
-        if kind is None:
-            raise unknown_kind(path)
-        chosen = FILES[kind]
-    content = chosen(path, how)
-    if isinstance(content, Motion):
-        content = Recording(path.name.split(".")[0], motion=content, skeleton=content.skeleton)
-    if isinstance(content, Recording):
-        content = Loaded(content, [Check("file").ok("read", content.note)] if content.note else [])
-    return content
+        return known(path, kinds())
+    possible = possible_kinds(path)
+    return known(path, possible) or possible[-1]
 
 
-def kind_of(path: Path) -> str | None:
-    """Suffix that determines a file's format, without compression; None for one that `load` does not know."""
-    suffixes = [suffix.lower() for suffix in path.suffixes if suffix.lower() not in PACKED]
-    return suffixes[-1] if suffixes and suffixes[-1] in FILES else None
+def of_name(name: str) -> list[Kind]:
+    """Our own kinds of a name: several formats of one kind of device."""
+    return [kind for kind in KINDS if kind.name == name]
 
 
-def unknown_kind(path: Path) -> WearcapError:
-    """The error for a file that no reader knows, with what to do about usual ones."""
+def possible_kinds(path: Path) -> list[Kind]:
+    """Kinds of files with a suffix. Raises WearcapError where there is none, with what to do about usual ones."""
+    if possible := [kind for kind in kinds() if kind.may_be(path)]:
+        return possible
     fix = {
         ".c3d": "Markers have no skeleton yet: solve them, and give the BVH.",
         ".fbx": "Export it as BVH (Blender, MotionBuilder and Maya do), and give that.",
         ".vrs": "It holds raw sensors: request Project Aria's MPS for it, and give the folder that MPS returns; with the extra "
         "wearcap[aria] the camera's pictures are taken from a data.vrs beside it.",
     }.get(path.suffix.lower(), "")
-    return WearcapError("not a kind of file that holds a recording", path, ", ".join(FILES), fix)
+    raise WearcapError("not a kind of file that holds a recording", path, ", ".join(SUFFIXES), fix)
+
+
+def sources(path: Path, how: Conventions = DETECTED) -> dict[str, Callable[[], Loaded]]:
+    """What loads each recording in a path, by name: a data set's, a folder's motions, else its logs; or the one that it is.
+
+    Raises WearcapError where there is none.
+    """
+    if not path.exists() and not (path.parent / MANIFEST).is_file():
+        raise WearcapError("no such file or folder", where=path)
+    if (path / MANIFEST).is_file():
+        return {name: partial(load, path / name, how) for name in RecordingStore.open(path).names()}
+    if path.is_file():
+        possible_kinds(path)  # raises for a file that nothing reads
+    if not path.is_dir():
+        return {path.name: partial(load, path, how)}
+    if kind := known(path, kinds()):
+        parts = kind.parts(path) if kind.parts else [None]
+        return {part or path.resolve().name: partial(kind.load, path, how, part) for part in parts}
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and any(k.may_be(file) for k in MOTIONS)]
+    files = files or list(log_files(path))
+    if not files:
+        raise WearcapError(
+            "nothing to examine here",
+            where=path,
+            expected=f"a data set (manifest.json), an MPS, Nymeria, ADT, TotalCapture or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), logs of watches, headsets or trajectories, or files like {', '.join(SUFFIXES)}",
+        )
+    return {file.relative_to(path).as_posix(): partial(load, file, how) for file in files}
 
 
 def _load_stored(path: Path) -> Loaded:
@@ -99,29 +138,10 @@ def _load_stored(path: Path) -> Loaded:
 
 def _load_foreign(path: Path, how: Conventions) -> Loaded:
     """A motion file of any origin on our skeleton; the note says what was detected."""
-    how.only("unit", "up", where=path)
     found = read_foreign_motion(path, how=how)
     motion, name = found.motion, path.name.split(".")[0]
     recording = Recording(name, motion=motion, skeleton=motion.skeleton, note=found.report.summary())
     return Loaded(recording, [Check("file").ok("a body was found", " ".join(found.report.lines()))])
-
-
-def _load_json(path: Path, how: Conventions) -> Loaded:
-    if trajectory_format(path):
-        return load_trajectory(path, how)
-    return load_log(path, how) if is_headset_log(path) else Loaded(*read_environment_file(path))
-
-
-def _load_npz(path: Path, how: Conventions) -> Recording | Motion | Loaded:
-    """A wearcap motion, Nymeria's suit data, DROID-SLAM's poses, or an AMASS file, recognised by its arrays."""
-    if path.name == "xdata.npz":
-        return _plain(lambda file: read_xdata(file)[0])(path, how)
-    if read_npz(path, ("traj_est", "tstamps", "tstamp")):
-        return load_trajectory(path, how)
-    if read_npz(path, ("wearcap",)):
-        return _plain(read_motion)(path, how)
-    how.only("up", where=path)
-    return read_amass(path, how.up)
 
 
 def _read_motion_folder(folder: Path) -> Recording:
@@ -130,53 +150,40 @@ def _read_motion_folder(folder: Path) -> Recording:
     return Recording(folder.resolve().name, motion=motion, skeleton=motion.skeleton)
 
 
-def _read_totalcapture(folder: Path) -> Recording:
-    """A sequence in Vicon's skeleton; where the sensors are mounted is not known."""
-    found = read_totalcapture(totalcapture_files(folder)[0])
-    return Recording(folder.resolve().name, motion=found.motion, imu=found.imu, source="TotalCapture")
-
-
 def _read_points(path: Path) -> Recording:
     points = (read_pcd if ".pcd" in path.suffixes else read_ply)(path).points
     return Recording(path.name, points=PointCloud(torch.from_numpy(points).float()))
 
 
-def _read_safetensors(path: Path) -> Recording | Loaded:
-    return Loaded(*read_map(path)) if is_map(path) else RecordingFile(path).load()
-
-
-def _plain(read_file: Callable[[Path], Recording | Motion | Loaded | tuple[Recording, list[Finding]]]) -> Read:
-    """A reader of a format that fixes all conventions: stated ones are refused."""
-
-    def read_fixed(path: Path, how: Conventions) -> Recording | Motion | Loaded:
-        how.only(where=path)
-        content = read_file(path)
-        return Loaded(*content) if isinstance(content, tuple) else content
-
-    return read_fixed
-
-
-FOLDERS: tuple[tuple[Callable[[Path], object], Read], ...] = (
-    (is_nymeria, _plain(read_nymeria)),
-    (is_mps_folder, _plain(load_mps)),
-    (is_adt, _plain(read_adt)),
-    (is_totalcapture, _plain(_read_totalcapture)),
-    (is_place, _plain(read_place)),
-    (motion_files, _plain(_read_motion_folder)),
-    (is_headset_session, load_headset),
-    (is_kit, load_kit),
-    (trajectory_file, load_trajectory),
+MOTIONS = (
+    Kind("AMC", _load_foreign, (".amc",), stated=("unit", "up")),
+    Kind("BVH", _load_foreign, (".bvh",), stated=("unit", "up")),
+    Kind("MVNX", read_suit, (".mvnx",)),
+    Kind(
+        "trajectory",
+        load_trajectory,
+        (".npz",),
+        lambda path: read_npz(path, ("traj_est", "tstamps", "tstamp")),
+        OF_TRAJECTORIES,
+    ),
+    Kind("motion", read_motion, (".npz",), lambda path: read_npz(path, ("wearcap",))),
+    Kind("AMASS", lambda path, how: read_amass(path, how.up), (".npz",), stated=("up",)),
 )
-"""Readers of folders, the first that knows it."""
-FILES: dict[str, Read] = {
-    ".amc": _load_foreign,
-    ".bvh": _load_foreign,
-    ".mvnx": _plain(read_suit),
-    ".npz": _load_npz,
-    ".safetensors": _plain(_read_safetensors),
-    ".json": _load_json,
-    **dict.fromkeys((".csv", ".tsv", ".txt", ".tum", ".log", ".jsonl", ".npy", ".bin", ".bsor"), load_log),
-    **dict.fromkeys((".ply", ".pcd"), _plain(_read_points)),
-}
-"""Readers of files by suffix."""
-MOTIONS = (".amc", ".bvh", ".mvnx", ".npz")
+"""Files that may hold a body's motion."""
+KINDS = (
+    Kind("MPS", load_mps, knows=is_mps_folder),
+    Kind("place", read_place, knows=is_place),
+    Kind("motion", _read_motion_folder, knows=motion_files),
+    Kind("headset", load_headset, knows=is_headset_session, stated=OF_HEADSETS),
+    Kind("kit", load_kit, knows=is_kit, stated=(*CHOICES, "unit", "fps")),
+    Kind("trajectory", load_trajectory, knows=trajectory_file, stated=OF_TRAJECTORIES),
+    *MOTIONS,
+    Kind("map", read_map, (".safetensors",), is_map),
+    Kind("recording", lambda path: RecordingFile(path).load(), (".safetensors",)),
+    *LOGS,
+    Kind("trajectory", load_trajectory, (".bin",), trajectory_format, OF_TRAJECTORIES),
+    Kind("environment", read_environment_file, (".json",)),
+    Kind("points", _read_points, (".ply", ".pcd")),
+)
+"""The kinds that wearcap itself knows; the first that knows a path is the one."""
+SUFFIXES = tuple(dict.fromkeys(suffix for kind in KINDS for suffix in kind.suffixes))

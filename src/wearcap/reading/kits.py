@@ -2,9 +2,9 @@
 MPS; and kits, the folders that hold the logs of one session."""
 
 import re
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.boundary.texts import read_json_object
@@ -18,6 +18,7 @@ from wearcap.io.devices.watch_log import is_watch_log, read_inertial_log, read_w
 from wearcap.io.formats.csv_table import read_header
 from wearcap.io.formats.trajectory import trajectory_format
 from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, log_name, read_path
+from wearcap.reading.kinds import Kind, Loaded, known
 from wearcap.recording import Recording
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.watches import watch_gaps
@@ -26,51 +27,15 @@ _SIDES = {
     "left_wrist": re.compile(r"(^|[^a-z])(left|l|links)([^a-z]|$)"),
     "right_wrist": re.compile(r"(^|[^a-z])(right|r|rechts)([^a-z]|$)"),
 }
-_TABLES = {".csv", ".tsv", ".txt", ".tum", ".log", ".json", ".jsonl", ".npy", ".bsor"}
+_TABLES = (".csv", ".tsv", ".txt", ".tum", ".log")
+OF_HEADSETS = "unit", "axes", "quaternion", "hands", "time_unit"
+OF_TRAJECTORIES = "unit", "up", "axes", "time_unit", "fps"
 _MOST = 200
 """Most files of a folder that are looked into."""
 
 
-class Loaded(NamedTuple):
-    """A recording, and its reader's findings."""
-
-    recording: Recording
-    findings: list[Finding]
-
-
-def log_kind(path: Path) -> str | None:
-    """ "watch", "headset" or "trajectory"; None for any other file. Raises WearcapError for one that cannot be opened."""
-    if path.suffix.lower() == ".bsor":
-        return "headset"
-    if path.suffix == ".npy":
-        return "trajectory" if trajectory_format(path) else None
-    if not {".json", ".jsonl"} & set(path.suffixes) and is_watch_log(path):
-        return "watch"
-    if is_headset_log(path):
-        return "headset"
-    return "trajectory" if trajectory_format(path) else None
-
-
-def load_log(path: Path, how: Conventions) -> Loaded:
-    """A watch's or headset's log, or a trajectory of any format, by content; what was detected is the recording's note.
-
-    Raises WearcapError for a table that is none of them, with the formats that are known.
-    """
-    kind = log_kind(path)
-    if kind == "watch":
-        how.only(where=path)
-        return _load_watch(path)
-    return load_headset(path, how) if kind == "headset" else load_trajectory(path, how)
-
-
 def load_trajectory(path: Path, how: Conventions) -> Loaded:
     """A head's path of any format, also from a folder of COLMAP's or DROID-SLAM's."""
-    name = path.resolve().name.split(".")[0]
-    if "aria_trajectory" in path.name or (path.is_file() and trajectory_format(path) == "MPS"):
-        how.only(where=path)
-        track = read_closed_loop(path).trajectory
-        return Loaded(Recording(name, head=head_stream(track, fps=None), source="Aria MPS"), [])
-    how.only("unit", "up", "axes", "time_unit", "fps", where=path)
     settings = TrajectorySettings(
         how.up,
         how.axes,
@@ -78,13 +43,18 @@ def load_trajectory(path: Path, how: Conventions) -> Loaded:
         None if how.fps == AUTO else float(how.fps),
         how.unit,
     )
-    recording = read_path(path, name, {}, settings)
+    recording = read_path(path, path.resolve().name.split(".")[0], {}, settings)
     return Loaded(recording, [Check("trajectory").ok("read", recording.note)])
+
+
+def load_closed_loop(path: Path) -> Recording:
+    """The path in one of MPS' files, at its own rate."""
+    head = head_stream(read_closed_loop(path).trajectory, fps=None)
+    return Recording(path.resolve().name.split(".")[0], head=head, source="Aria MPS")
 
 
 def load_headset(path: Path, how: Conventions) -> Loaded:
     """A headset's log, or the folder of a session of one."""
-    how.only("unit", "axes", "quaternion", "hands", "time_unit", where=path)
     time_unit = None if how.time_unit == AUTO else how.time_unit
     settings = HeadsetSettings(how.unit, how.axes, how.quaternion, how.hands, time_unit)
     recording = settings.read(path, log_name(path), {})
@@ -153,7 +123,7 @@ def _read_watch(path: Path, joint: str) -> tuple[ImuStream, Finding]:
     return stream, check.ok(what, evidence)
 
 
-def _load_watch(path: Path) -> Loaded:
+def load_watch(path: Path) -> Loaded:
     """One watch's log; the wrist that it was worn on is in its name, or its folder's."""
     joint = _side(path)
     stream, found = _read_watch(path, joint or WRISTS[0])
@@ -164,26 +134,31 @@ def _load_watch(path: Path) -> Loaded:
     return Loaded(Recording(path.name.split(".")[0], imu={stream.joint: stream}), findings)
 
 
-# --- kits ----------------------------------------------------------------------------------------------------------
+_TEXTS = (*_TABLES, ".jsonl", ".json")
+LOGS = (
+    Kind("headset", load_headset, (".bsor",), stated=OF_HEADSETS),
+    Kind("watch", load_watch, _TABLES, is_watch_log),
+    Kind("headset", load_headset, _TEXTS, is_headset_log, OF_HEADSETS),
+    Kind("trajectory", load_closed_loop, _TEXTS, lambda path: trajectory_format(path) == "MPS"),
+    Kind("trajectory", load_trajectory, (*_TEXTS, ".npy"), trajectory_format, OF_TRAJECTORIES),
+)
+"""Logs of one device, by content."""
 
 
-def log_files(folder: Path) -> dict[Path, str]:
+def log_files(folder: Path) -> dict[Path, Kind]:
     """Logs of a folder with their kinds; of a sensor's files in a folder of its own the inertial one."""
     found = {}
     for path in sorted(folder.iterdir())[:_MOST]:
-        if path.is_file() and {suffix.lower() for suffix in path.suffixes} & _TABLES:
-            try:
-                kind = log_kind(path)
-            except WearcapError:
-                continue
-            if kind is not None and not (kind == "watch" and sensor_files(path)[0] != path):
+        with suppress(WearcapError):
+            kind = known(path, LOGS)
+            if kind is not None and not (kind.name == "watch" and sensor_files(path)[0] != path):
                 found[path] = kind
     return found
 
 
 def is_kit(folder: Path) -> bool:
     """Whether a folder holds the logs of one session: watches', or one headset's."""
-    kinds = list(log_files(folder).values())
+    kinds = [kind.name for kind in log_files(folder).values()]
     return "watch" in kinds or kinds.count("headset") == 1
 
 
@@ -194,11 +169,11 @@ def load_kit(folder: Path, how: Conventions) -> Loaded:
     """
     logs, findings = log_files(folder), list[Finding]()
     parts = Recording(name=folder.resolve().name)
-    watches = [path for path, kind in logs.items() if kind == "watch"]
+    watches = [path for path, kind in logs.items() if kind.name == "watch"]
     sides = _sides(watches, findings)
     for path, kind in logs.items():
         try:
-            if kind == "watch":
+            if kind.name == "watch":
                 if path not in sides:
                     continue
                 stream, found = _read_watch(path, sides[path])
@@ -209,7 +184,7 @@ def load_kit(folder: Path, how: Conventions) -> Loaded:
                 what = "a second path of the head"
                 findings.append(Check(f"log {path.name}").warning(what, "it is left out", "Move it to another folder."))
                 continue
-            read, found = load_log(path, how)
+            read, found = kind.load(path, how)
             findings += found
             parts = replace(read, name=parts.name, imu=parts.imu)
         except WearcapError as error:

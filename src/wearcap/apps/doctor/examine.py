@@ -1,20 +1,15 @@
 """Examine everything in a path: data sets, files, folders of devices and data sets, scenes, environments, motion capture."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-from wearcap.checks.consistency import check_files
 from wearcap.checks.examine import examine_recording, is_empty
 from wearcap.checks.report import Finding, Report, has_error, refusal
 from wearcap.checks.truth import of_person, people
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import DETECTED, Conventions
-from wearcap.io.datasets.hps import hps_names, read_hps_sequence
-from wearcap.reading.any_file import FILES, FOLDERS, MOTIONS, kind_of, load, unknown_kind
-from wearcap.reading.kits import Loaded, log_files
+from wearcap.reading.any_file import sources
 from wearcap.recording import Recording, RecordingStore
-from wearcap.recording.store import MANIFEST
 
 
 def examine(
@@ -32,7 +27,7 @@ def examine(
     """
     if isinstance(source, Recording):
         return Report(source.name, {source.name: tuple(examine_recording(source))})
-    found = _patients(Path(source), how)
+    found = sources(Path(source), how)
     findings: dict[str, tuple[Finding, ...]] = {}
     for done, (name, load_one) in enumerate(found.items(), 1):
         try:
@@ -51,36 +46,6 @@ def examine(
     )
     findings |= {f"person {subject}": tuple(of_person(person)) for subject, person in figures.items()}
     return Report(str(source), findings, figures)
-
-
-def _patients(path: Path, how: Conventions) -> dict[str, Callable[[], Loaded]]:
-    """What loads each recording in a path, by name. Raises WearcapError when there is nothing to examine."""
-    if not path.exists() and not (path.parent / MANIFEST).is_file():
-        raise WearcapError("no such file or folder", where=path)
-    if (path / MANIFEST).is_file():
-        return {name: partial(load, path / name, how) for name in RecordingStore.open(path).names()}
-    if not path.is_dir():
-        if path.exists() and kind_of(path) is None:
-            raise unknown_kind(path)
-        return {path.name: partial(load, path, how)}
-    if any(is_kind(path) for is_kind, _ in FOLDERS):
-        return {path.resolve().name: partial(load, path, how)}
-    if names := hps_names(path):
-        return {name: partial(_load_hps, path, name) for name in names}
-    files = [file for file in sorted(path.rglob("*")) if file.is_file() and kind_of(file) in MOTIONS]
-    files = files or list(log_files(path))
-    if not files:
-        raise WearcapError(
-            "nothing to examine here",
-            where=path,
-            expected=f"a data set (manifest.json), an MPS, Nymeria, ADT, TotalCapture or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), logs of watches, headsets or trajectories, or files like {', '.join(FILES)}",
-        )
-    return {file.relative_to(path).as_posix(): partial(load, file, how) for file in files}
-
-
-def _load_hps(root: Path, name: str) -> Loaded:
-    recording = read_hps_sequence(root, name)
-    return Loaded(recording, check_files(recording, root))
 
 
 def _folder_of(path: Path) -> Path | None:

@@ -25,8 +25,8 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.correlation import best_shift
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.devices.head_alignment import best_shift
 
 RATE_HZ = 100.0
 SMOOTH_S = 0.15

@@ -16,6 +16,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.devices.axes import WORLDS
 from wearcap.io.formats.csv_table import iter_columns, read_columns, read_header
 from wearcap.io.formats.poses import check_finite, checked_trajectory
 from wearcap.recording import HeadStream, PointCloud, Recording
@@ -95,18 +96,9 @@ def read_closed_loop(path: str | Path) -> ClosedLoop:
         fix = "Rotate the world, or fix gravity's sign."
         raise WearcapError(f"gravity points along {mean.round(2).tolist()}", path, "-z, or -y", fix)
     trajectory = checked_trajectory(table[time] * 1e-6, columns["pose"][:, :3], columns["pose"][:, 3:], path)
-    T_turned = Rigid(turn_up(up), torch.zeros(3)) @ trajectory.T_world_body
+    T_turned = Rigid(WORLDS[up], torch.zeros(3)) @ trajectory.T_world_body
     turned = Trajectory(trajectory.timestamps, T_turned.R, T_turned.t)
     return ClosedLoop(turned, torch.tensor(table[quality], dtype=torch.float32), up)
-
-
-def turn_up(up: str) -> Float[Tensor, "3 3"]:
-    """Rotation of a right-handed world whose `up` axis is "y" or "z" into one with z up (x stays x)."""
-    if up not in ("y", "z"):
-        raise WearcapError(f"up axis {up!r}", expected="'y' or 'z'")
-    if up == "z":
-        return torch.eye(3)
-    return torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def head_stream(

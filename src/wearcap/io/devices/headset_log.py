@@ -25,7 +25,7 @@ from wearcap.io.devices.headset_tables import (
     read_rows,
 )
 from wearcap.io.formats.bsor import is_bsor, read_bsor
-from wearcap.io.formats.trajectory import UNITS
+from wearcap.io.formats.times import UNITS
 
 __all__ = ["PALM_M", "HeadsetLog", "is_headset_log", "is_headset_session", "read_headset_log"]
 _TABLES = {".csv", ".tsv", ".txt", ".json", ".jsonl"}

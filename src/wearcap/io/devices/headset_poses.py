@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from wearcap.errors import WearcapError
 from wearcap.io.devices.headset_tables import DeviceRows, RawPoses, parts_of
-from wearcap.io.devices.headset_times import grain, in_seconds, rising
-from wearcap.io.formats.trajectory import check_span
+from wearcap.io.formats.times import check_span, evenly_spread, grain, in_order, in_seconds, without_repeats
 
 _KINDS = {"wrist": {"wrist"}, "grip": {"grip"}}
 ARKIT = {"origin", "from", "anchor"}
@@ -48,12 +47,11 @@ def raw_poses(
         seen, times = _seen(position, rotation), table.clocks[clock]
         if shared is None or not np.array_equal(times, rows["head"].clocks[clock], equal_nan=True):
             seconds, shown = _seconds(table, clock, time_unit, path)[0], np.where(seen[:, None], position, np.nan)
-            *ordered, mended = rising(seconds, shown, table.rows, table.where, path)
-            notes += [f"{joint}: {mended}"] if mended else []
-            shared = shared or ordered
+            seconds, kept, mended = _in_order(seconds, shown, table, path)
+            notes += [f"{joint}: {note}" for note in mended]
+            shared = shared or (seconds, kept)
         else:
-            ordered = shared
-        seconds, kept = ordered
+            seconds, kept = shared
         seen = seen[kept]
         _check_rotations(rotation[kept][seen], table.rows[kept][seen], f"{table.where} ", path)
         kind = next((kind for kind, known in _KINDS.items() if table.columns.words & known), None)
@@ -64,6 +62,18 @@ def raw_poses(
             raise WearcapError("no two tracked poses of the headset", path, "positions and rotations")
     check_span(poses["head"].seconds, path, lambda row: f"pose {row + 1} of the head")
     return _together(poses, notes), notes
+
+
+def _in_order(
+    seconds: np.ndarray, position: np.ndarray, table: DeviceRows, path: Path
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Times (m,) that rise, the rows (m,) that they are of, and notes; a clock that is coarser than the rows is spread."""
+    whole = np.ones(len(seconds), dtype=bool)
+    order, notes = in_order(seconds, position, whole, "a time", path, lambda row: f"{table.where} {table.rows[row]}")
+    if spread := evenly_spread(seconds, position, order):
+        return spread[0], order, notes + spread[1]
+    kept, repeated = without_repeats(seconds, position, order)
+    return seconds[kept], kept, notes + repeated
 
 
 def _of_rows(pose: RawPoses, kept: np.ndarray) -> RawPoses:

@@ -24,7 +24,7 @@ from wearcap.boundary.limits import LIMITS
 from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import numbered_lines, parse_json, read_json
 from wearcap.errors import WearcapError
-from wearcap.io.devices.headset_times import moment
+from wearcap.io.formats.times import moment
 
 _DEVICES = {
     "left_wrist": {"left", "l", "lefthand", "leftcontroller", "leftwrist", "lhand"},

@@ -28,7 +28,7 @@ from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matr
 from wearcap.geometry.trajectory import slerp
 from wearcap.io.formats.csv_table import read_columns, read_layout
 from wearcap.io.formats.poses import are_rotations
-from wearcap.io.formats.trajectory import UNITS, time_unit_of
+from wearcap.io.formats.times import UNITS, in_order, time_unit_of, unit_named, without_repeats
 from wearcap.recording import ImuStream
 
 G_M_S2 = 9.80665
@@ -366,39 +366,25 @@ def _seconds(path: Path, header: list[str], about: str) -> np.ndarray:
             return times / float(rate[1])
         if key == "sampletimefine":  # µs of Movella DOT, else ticks of 0.1 ms
             return times * (1e-6 if np.median(np.abs(np.diff(times[known]))) >= 1000 else 1e-4)
-        unit = re.search(r"(?:\b|_)([mun]?s)\b", column.lower().replace("µ", "u"))
-        return times * UNITS[time_unit_of(times[known], unit and unit[1], path)]
+        return times * UNITS[time_unit_of(times[known], unit_named(column), path)]
     raise WearcapError("no times", path, "time, timestamp, SampleTimeFine, or PacketCounter with the update rate above")
 
 
 def _in_order(seconds: np.ndarray, parts: dict[str, np.ndarray], names: dict[str, str], path: Path) -> _Samples:
     """Rows in the order of time, one for each time, with notes of what was done for it.
 
-    Raises WearcapError for fewer than 2 rows or 20 a second, and for a clock that starts again.
+    Raises WearcapError for fewer than 2 rows or 20 a second, and for two recordings in one file.
     """
-    table = np.concatenate([seconds[:, None], *parts.values()], 1)
-    whole = np.isfinite(table).all(1)
-    table = table[whole]
-    behind = np.maximum.accumulate(table[:, 0]) - table[:, 0]
-    order = np.argsort(table[:, 0], kind="stable")
-    table, late = table[order], behind[order] > 0
-    repeats = np.diff(table[:, 0], prepend=-np.inf) == 0
-    same = np.append(False, (table[1:] == table[:-1]).all(1))[: len(table)]
-    if behind.max(initial=0) > 1 and np.count_nonzero(np.diff(late[~same])) > 0.05 * len(table):
-        what = f"the clock goes back by {behind.max():.1f} s, to times that other rows have"
-        raise WearcapError(what, path, "one recording", "Two recordings stand in one file: cut it there.")
-    counts = {
-        "without a number in every column: left out": ~whole,
-        "out of order: sorted": late,
-        "repeated: left out": repeats & same,
-        "with other values at the time of another: the first is kept": repeats & ~same,
-    }
-    notes = [f"{rows.sum()} rows {what}" for what, rows in counts.items() if rows.any()]
-    table = table[~repeats]
-    if len(table) < 2:
-        raise WearcapError(f"{len(table)} rows with numbers and a time of their own", path, "at least 2")
-    rate = 1 / np.median(np.diff(table[:, 0]))
+    values = np.concatenate([np.zeros((len(seconds), 0)), *parts.values()], 1)  # all may have been without numbers
+    # An attitude is smooth but for its sign; other numbers may jump from row to row.
+    smooth = np.abs(parts["quaternion"]) if "quaternion" in parts else values
+    whole = np.isfinite(values).all(1)
+    order, notes = in_order(seconds, smooth, whole, "a number in every column", path)
+    kept, repeated = without_repeats(seconds, values, order)
+    seconds = seconds[kept]
+    if len(seconds) < 2:
+        raise WearcapError(f"{len(seconds)} rows with numbers and a time of their own", path, "at least 2")
+    rate = 1 / np.median(np.diff(seconds))
     if rate < MIN_RATE_HZ:
         raise WearcapError(f"{rate:.1f} rows a second", path, f"at least {MIN_RATE_HZ:g}", "Log at 30 Hz or more.")
-    first, *values = np.split(table, np.cumsum([1, *(part.shape[1] for part in parts.values())])[:-1], 1)
-    return _Samples(np.ascontiguousarray(first[:, 0]), dict(zip(parts, values)), names, notes)
+    return _Samples(seconds, {name: values[kept] for name, values in parts.items()}, names, notes + repeated)

@@ -2,7 +2,7 @@
 
 A bone's rotation is L = C · R(dof) · C⁻¹ with C the bone's own axes in the bind pose; G = G_parent · L; a bone ends at
 its parent's end + G · direction · length. Files are y up with the body facing +z at rest, in degrees and inches over
-the file's length scale (CMU: 1 unit = 0.0254 / 0.45 m).
+the file's length scale (CMU: 1 unit = 0.0254 / 0.45 m). Their axes are SMPL's, which `A` turns to wearcap's.
 """
 
 import math
@@ -24,10 +24,8 @@ from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
+from wearcap.io.formats.smpl import A
 from wearcap.recording.motion import Motion
-
-R_WORLD_FILE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-"""Rotation of the file's axes (x left, y up, z forward) into wearcap's (x forward, y left, z up)."""
 
 INCH_M = 0.0254
 MAX_BONES = LIMITS["asf"].items
@@ -83,7 +81,7 @@ def read_asf(path: str | Path) -> _AsfSkeleton:
     table = [content.root, *(content.bones[name] for name in names[1:])]
     ends = torch.tensor([bone.direction for bone in table], dtype=torch.float64)
     lengths = torch.tensor([bone.length for bone in table], dtype=torch.float64)
-    ends = ends * lengths[:, None] * unit_m @ R_WORLD_FILE.T
+    ends = ends * lengths[:, None] * unit_m @ A.T
     offsets = ends[[max(parent, 0) for parent in parents]]
     offsets[0] = 0
     leaves = {name: ends[joint] for joint, name in enumerate(names) if joint not in parents}
@@ -131,12 +129,12 @@ def read_amc(asf: _AsfSkeleton, path: str | Path, fps: float | int = 120) -> Mot
     C = asf.R_bind_axis
     # The root's own axes are its starting orientation: they turn the body and are not undone.
     undo = torch.cat([torch.eye(3, dtype=torch.float64)[None], C[1:].transpose(-1, -2)])
-    R = (R_WORLD_FILE @ C) @ R @ (undo @ R_WORLD_FILE.T)
+    R = (A @ C) @ R @ (undo @ A.T)
     return Motion(
         torch.from_numpy((frames - frames[0]) / fps),
         asf.skeleton,
         R.float(),
-        (t_root @ R_WORLD_FILE.T).float(),
+        (t_root @ A.T).float(),
         provenance={"source": path.name, "format": "amc"},
     )
 

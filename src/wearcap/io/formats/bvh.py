@@ -26,6 +26,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.motion_npz import even_frames
+from wearcap.io.formats.smpl import A
 from wearcap.recording.motion import Motion
 
 _CHANNELS = {f"{axis}{kind}": (kind[0], axis) for axis in "xyz" for kind in ("position", "rotation")}
@@ -49,7 +50,7 @@ UNITS_M = {
 REACH_PER_HEIGHT = 1.46
 """Longest path along the bones (fingertip to toe tip) over body height; in the tested skeletons 1.46 … 1.53."""
 HEIGHT_M = (0.6, 2.6)
-_R_FILE_WORLD = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+_R_FILE_WORLD = A.T.contiguous()
 """wearcap's axes in those of the files that are written."""
 
 

@@ -51,7 +51,7 @@ def read_motion(path: str | Path) -> Motion:
     """Read what `write_motion` wrote. Raises WearcapError when it is missing, damaged, not finite or foreign."""
     arrays = read_npz(path)
     if "wearcap" not in arrays:
-        fix = "AMASS files are read by io.datasets.amass."
+        fix = "AMASS files are read by io.formats.amass."
         raise WearcapError("an .npz file, but not of ours", path, "one that write_motion wrote", fix)
     try:
         tree = parse_json(str(arrays.pop("wearcap")), path)

@@ -1,4 +1,7 @@
-"""PLY files (ASCII, binary little and big endian): points with colours, and triangle meshes."""
+"""PLY files (ASCII, binary little and big endian): points with colours, and triangle meshes.
+
+trimesh, which shows them, takes a file that was cut short for a whole one, and no binary file of several kinds of polygons.
+"""
 
 import io
 import warnings

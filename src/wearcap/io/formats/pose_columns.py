@@ -59,11 +59,9 @@ def places_of(words: Sequence[str]) -> dict[str, int] | None:
     return found if found.keys() == set(SLOTS) else None
 
 
-def unit_of(header: str) -> str | None:
-    """Unit of time that a header's first column names."""
-    first = re.split(r"[,\s]\s*(?=[a-z])", header.lower().lstrip("# \t"), maxsplit=1)[0]
-    found = re.search(r"(?:\[|\(|_)(ns|us|µs|ms|s|sec)\b", first)
-    return {"µs": "us", "sec": "s"}.get(found[1], found[1]) if found else None
+def first_column(header: str) -> str:
+    """Name of a header's first column, which may hold spaces, in small letters."""
+    return re.split(r"[,\s]\s*(?=[a-z])", header.lower().lstrip("# \t"), maxsplit=1)[0]
 
 
 def quaternion_first(table: np.ndarray) -> np.ndarray:

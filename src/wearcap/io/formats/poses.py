@@ -48,29 +48,6 @@ def checked_trajectory(
     )
 
 
-def tracked_in_order(
-    timestamps: np.ndarray, translation: np.ndarray, quat_wxyz: np.ndarray
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Rows that hold a pose, by time and each time once, and a sentence with a count on each kind that is left out.
-
-    Rows without a pose are what systems write while tracking is lost: values that are not finite, or a quaternion of
-    zeros. Of rows of one time the first is kept.
-    """
-    seen = np.isfinite(translation).all(1) & np.isfinite(quat_wxyz).all(1) & (quat_wxyz != 0).any(1)
-    seen &= np.isfinite(timestamps)
-    rows = np.flatnonzero(seen)
-    times = timestamps[rows]
-    late = int((np.diff(times) < 0).sum())
-    order = np.argsort(times, kind="stable")
-    first = np.diff(times[order], prepend=-np.inf) > 0
-    counts = {
-        "rows without a pose (tracking lost) are left out": len(seen) - len(rows),
-        "rows that repeat a time are left out": int((~first).sum()),
-        "rows are earlier than the ones before them: all are sorted by time": late,
-    }
-    return rows[order][first], tuple(f"{count} {what}" for what, count in counts.items() if count)
-
-
 def check_finite(columns: dict[str, np.ndarray], where: str | Path, name: Callable[[int], str] = row_name) -> None:
     """Raise WearcapError naming the first row and column that is NaN, infinite, or beyond single precision."""
     for column, values in columns.items():

@@ -11,9 +11,9 @@ import numpy as np
 from wearcap.boundary.opening import path_inside, understood
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hps import is_hps_scene, read_hps_scene
 from wearcap.io.formats.camera_json import PHOTOS_FILE, read_photos
 from wearcap.io.formats.colmap import Tracks, read_colmap
+from wearcap.io.formats.navvis import is_navvis_scan, read_navvis_scan
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
 from wearcap.scene.scan import Photo, Scan
@@ -81,8 +81,8 @@ def read_scene(
         raise WearcapError("no such folder", folder, "a scene's folder")
     if (folder / PHOTOS_FILE).is_file():
         return read_photos(folder), read_scan(folder / CLOUD, metres_per_unit=metres_per_unit)
-    if is_hps_scene(folder):
-        cloud, photos = read_hps_scene(folder)
+    if is_navvis_scan(folder):
+        cloud, photos = read_navvis_scan(folder)
         return photos, read_scan(cloud, metres_per_unit=metres_per_unit)
     if any((folder / f"images.{ending}").is_file() for ending in ("bin", "txt")):
         model = read_colmap(folder, images)

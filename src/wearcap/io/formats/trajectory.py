@@ -40,25 +40,17 @@ from wearcap.io.formats.pose_columns import (
     MATRIX_WITHIN,
     STATES,
     TUM,
+    first_column,
     is_matrix,
     is_number,
     places_of,
     quaternion_first,
-    unit_of,
     usual_axes,
     words_of,
 )
-from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name, tracked_in_order
+from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name
+from wearcap.io.formats.times import UNITS, check_span, in_order, time_unit_of, unit_named, without_repeats
 
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Seconds per unit of time."""
-STEP_S = (0.9e-3, 2.0)
-"""Least and largest median time between poses: 1.1 kHz to one in two seconds."""
-MAX_GAP_S, MAX_SPAN_S = 600.0, 12 * 3600.0
-MAX_SPARSITY = 10.0
-"""Largest ratio of a file's span to what its rows cover at their median step."""
-_EPOCH_S = 9e8, 4.2e9
-"""Seconds since 1970 of the years 1998 to 2103."""
 _FAR, _FAR_FOR_EXTENT, _NOWHERE = 1e4, 20.0, 1e9
 """Distance from zero from which places are a map's, in units and in extents of the path, and from which they are none."""
 _FRAMES = 1e6
@@ -134,34 +126,29 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
     if table.inverse:
         table = _inverted(table)
     seconds, unit = _seconds(table, time_unit, fps, path)
-    rows, notes = tracked_in_order(seconds, table.translation, table.quat_wxyz)
+    lost = ~np.isfinite(table.translation).all(1) | ~np.isfinite(table.quat_wxyz).all(1)
+    lost |= (table.quat_wxyz == 0).all(1)  # as systems write it while tracking is lost
+    rows, notes = in_order(seconds, table.translation, ~lost, "a pose (tracking lost)", path, table.name)
+    rows, repeated = without_repeats(seconds, table.translation, rows)
+    notes += repeated
     if len(rows) < min(2, len(seconds)):
         what = f"{len(rows)} poses in its {len(seconds)} rows; {'; '.join(notes)}"
         raise WearcapError(what, path, "finite numbers, unit quaternions, and times that differ")
-    written, seconds, translation = seconds, seconds[rows], table.translation[rows].astype(np.float64)
+    seconds, translation = seconds[rows], table.translation[rows].astype(np.float64)
     origin = map_origin(translation)
     if origin is not None:
         translation = translation - origin
         listed = ", ".join(f"{value:.0f}" for value in origin)
-        notes += (f"positions are at a map's coordinates: ({listed}) is taken off, and kept as the origin",)
+        notes.append(f"positions are at a map's coordinates: ({listed}) is taken off, and kept as the origin")
 
     def name(row: int) -> str:
         return table.name(int(rows[row]))
 
     trajectory = checked_trajectory(seconds, translation, table.quat_wxyz[rows], path, name)
     check_span(seconds, path, name)
-    _require_one_recording(table, written, rows, path)
-    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric, origin, notes, table.usual)
-
-
-def _require_one_recording(table: _Table, seconds: np.ndarray, rows: np.ndarray, path: Path) -> None:
-    """Raise WearcapError where sorted rows go to and fro between two paths, which is much longer than either."""
-    written = np.sort(rows)
-    lengths = [np.linalg.norm(np.diff(table.translation[at], axis=0), axis=1).sum() for at in (written, rows)]
-    if lengths[1] > 1.5 * lengths[0] + 1e-6:
-        again = int(written[1:][np.diff(seconds[written]) < 0][0])
-        what = f"times start again at {table.name(again)}, and in the order of times the path goes to and fro"
-        raise WearcapError(what, path, "one recording", "Two recordings stand in one file: cut it there.")
+    return TrajectoryFile(
+        trajectory, table.format, unit, table.of_camera, table.metric, origin, tuple(notes), table.usual
+    )
 
 
 def map_origin(translation: Float64[np.ndarray, "pose 3"]) -> Float64[np.ndarray, "3"] | None:
@@ -307,7 +294,7 @@ def _named_columns(path: Path, kind: str, header: dict[str, int] | None) -> _Tab
         text = line.split("#")[0].strip()
         words = words_of(text or line.lstrip("# \t"))
         if not text or (not values and not any(map(is_number, words))):  # a comment, or a header without #
-            unit, heading = unit or unit_of(line), heading or line.lower()
+            unit, heading = unit or unit_named(first_column(line)), heading or line.lower()
             state = next((place for place, word in enumerate(words) if word.lower() in STATES), state)
             continue
         if len(words) != 8 if exact else len(words) <= max(places):
@@ -530,49 +517,3 @@ def _seconds(table: _Table, time_unit: str | None, fps: float | None, path: Path
     unit = time_unit or time_unit_of(times, table.unit, path)
     # Whole nanoseconds since 1970 are beyond a float's 53 bits; what is lost is below a microsecond.
     return times * UNITS[unit], unit
-
-
-def time_unit_of(times: np.ndarray, named: str | None, where: str | Path) -> str:
-    """Unit of times by their median step; the named one, then seconds since 1970, decide between two that are possible.
-
-    Raises WearcapError when no unit gives a plausible rate.
-    """
-    steps = np.diff(times)
-    rising = steps[steps > 0]
-    if not len(rising):
-        possible = list(UNITS)
-    else:
-        step = float(np.median(rising))
-        possible = [unit for unit, s in UNITS.items() if STEP_S[0] <= step * s <= STEP_S[1]]
-        if not possible:
-            what = f"{step:.4g} between successive times, which is no recording's in seconds, ms, µs or ns"
-            raise WearcapError(what, where, "0.5 to 1100 poses in a second", "Give time_unit=s, ms, us or ns.")
-    if named in possible:
-        return str(named)
-    since_1970 = [unit for unit in possible if _EPOCH_S[0] <= float(times[0]) * UNITS[unit] <= _EPOCH_S[1]]
-    return (since_1970 or possible)[0]
-
-
-def check_span(seconds: np.ndarray, path: Path, name: Callable[[int], str]) -> None:
-    """Raise WearcapError for times that no recording has: nothing made of them is much larger than the file."""
-    steps = np.diff(seconds)
-    if not len(steps):
-        return
-    widest, span = int(steps.argmax()), float(seconds[-1] - seconds[0])
-    covered = float(np.median(steps)) * len(seconds)
-    cut = "A time is damaged, or two recordings stand in one file: cut it there."
-    if steps[widest] > MAX_GAP_S:
-        what = f"a gap of {_plain_span(steps[widest])} before {name(widest + 1)}"
-        raise WearcapError(what, path, f"gaps below {MAX_GAP_S / 60:.0f} minutes", cut)
-    if span > MAX_SPAN_S:
-        what = f"poses over {_plain_span(span)}"
-        raise WearcapError(what, path, f"a recording of less than {MAX_SPAN_S / 3600:.0f} hours", cut)
-    if span > MAX_SPARSITY * covered + 10.0:
-        what = (
-            f"poses in {100 * covered / span:.0f} % of {_plain_span(span)}, the longest gap before {name(widest + 1)}"
-        )
-        raise WearcapError(what, path, f"poses in {100 / MAX_SPARSITY:.0f} % of the time at least", cut)
-
-
-def _plain_span(seconds: float) -> str:
-    return f"{seconds / 3600:.3g} hours" if seconds >= 3600 else f"{seconds:.4g} s"

@@ -13,9 +13,11 @@ from wearcap.boundary.texts import read_json_object
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.devices.aria_mps import head_stream, read_closed_loop, turn_up
+from wearcap.io.devices.aria_mps import head_stream, read_closed_loop
+from wearcap.io.devices.axes import WORLDS
 from wearcap.io.formats.csv_table import read_columns
 from wearcap.io.formats.poses import check_finite, check_rising, checked_trajectory
+from wearcap.reading.kinds import Kind
 from wearcap.recording import Cue, Recording
 
 _BODY = {
@@ -64,7 +66,7 @@ def read_skeleton(path: str | Path, up: str = "y") -> dict[str, Cue]:
         raise WearcapError(f"joints of shape {joints.shape}", path, f"(frames, {_JOINTS}, 3)")
     check_finite({"joints": joints}, path)
     check_rising(times, path)
-    world = torch.tensor(joints, dtype=torch.float32) @ turn_up(up).T
+    world = torch.tensor(joints, dtype=torch.float32) @ WORLDS[up].T
     timestamps, sure = torch.from_numpy(times), torch.ones(len(times))
     return {name: Cue(timestamps, name, world[:, row], sure) for name, row in _BODY.items()}
 
@@ -99,7 +101,11 @@ def read_moving_objects(folder: str | Path, up: str = "y") -> dict[str, Trajecto
         last = 1 if timeless else len(rows)
         table = np.stack([poses[axis][rows] for axis in axes], 1)[:last]
         track = checked_trajectory(times[:last], table[:, :3], table[:, 3:], path)
-        T_world_obj = Rigid(turn_up(up), torch.zeros(3)) @ track.T_world_body
+        T_world_obj = Rigid(WORLDS[up], torch.zeros(3)) @ track.T_world_body
         if about.get("motion_type") == "dynamic" and not timeless:
             found[str(about.get("instance_name", name))] = Trajectory(track.timestamps, T_world_obj.R, T_world_obj.t)
     return found
+
+
+KINDS = (Kind("ADT", read_adt, knows=is_adt),)
+"""How `wearcap.read` knows the data set, which has no true body to prepare."""

@@ -1,1 +1,0 @@
-"""Public data sets, each in its own layout."""
