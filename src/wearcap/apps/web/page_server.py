@@ -19,8 +19,9 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from wearcap.apps.web.connections import BACKLOG, DELIVERING, CountedConnection
+from wearcap.apps.web.connections import BACKLOG, DELIVERING
 from wearcap.apps.web.guard import Guard, Refused
+from wearcap.apps.web.sockets import CountedConnection
 from wearcap.errors import WearcapError
 
 _starting = threading.Lock()

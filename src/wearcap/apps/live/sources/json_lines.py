@@ -10,25 +10,21 @@
 
 import asyncio
 import contextlib
-import logging
 import secrets
 from collections.abc import Callable
-from http import HTTPStatus
 from typing import Any
 
 import msgspec
 import numpy as np
 import torch
-from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request, Response
 
 from wearcap.apps.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet, Sample
 from wearcap.apps.live.source import Address, Budget, DatagramSource
 from wearcap.apps.live.sources.parts import AXES, BAD_NAME, Names, checked_pose, matrix_of
-from wearcap.apps.live.sources.posts import admitting
-from wearcap.apps.web.connections import BACKLOG, DELIVERING, SPOKEN, CountedConnection
-from wearcap.apps.web.guard import Refused
+from wearcap.apps.web.connections import DELIVERING, SPOKEN
+from wearcap.apps.web.guard import Guard
+from wearcap.apps.web.sockets import serve_sockets
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -41,8 +37,6 @@ MAX_MESSAGE, MAX_POINTS_MESSAGE = 1 << 16, 1 << 20
 """Bytes of a message over WebSocket; the larger one for messages with points."""
 MAX_POINTS = 20_000
 MAX_BYTES_PER_S = 1 << 22
-_QUIET = logging.Logger("wearcap.apps.live", logging.CRITICAL + 1)
-"""What goes wrong with a connection is counted, not printed."""
 
 NO_JSON = "no JSON object"
 UNKNOWN_KEY = "unknown key"
@@ -227,19 +221,16 @@ class WebSocketSource(JsonSource):
         return f"{super().url}/" + (f"?token={self.token}" if self.token else "")
 
     async def run(self, inbox: Inbox) -> None:
-        admit = admitting(self.address.host, self.token or None)
-
-        def admitted(connection: ServerConnection, request: Request) -> Response | None:
-            """An answer that ends a handshake, or None to go on."""
-            try:
-                admit(request.path, request.headers)
-            except Refused as refused:
-                inbox.refuse(self.name, "forbidden")
-                return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
-            return None
-
+        guard = Guard(self.address.host, self.token) if self.token else Guard(self.address.host, open=True)
         try:
-            server = await self._server(lambda connection: self._listen(connection, inbox), admitted)
+            server = await serve_sockets(
+                lambda connection: self._listen(connection, inbox),
+                self.address.host,
+                self.address.port,
+                guard,
+                lambda why: inbox.refuse(self.name, why),
+                MAX_POINTS_MESSAGE,
+            )
         except OSError as error:
             raise self.cannot_listen(error) from error
         self.listens = True
@@ -248,23 +239,6 @@ class WebSocketSource(JsonSource):
         finally:
             server.close()
             await server.wait_closed()
-
-    async def _server(self, listen: Any, admitted: Any) -> Server:
-        return await serve(
-            listen,
-            self.address.host,
-            self.address.port,
-            process_request=admitted,
-            create_connection=CountedConnection,
-            backlog=BACKLOG,
-            compression=None,  # a small message could unpack to a large one
-            max_size=MAX_POINTS_MESSAGE,
-            max_queue=16,
-            open_timeout=5,
-            close_timeout=1,
-            server_header=None,
-            logger=_QUIET,
-        )
 
     async def _listen(self, connection: Any, inbox: Inbox) -> None:
         """Deliver what one adapter sends."""
