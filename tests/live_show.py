@@ -8,7 +8,7 @@ import torch
 
 from walking_person import SEAT, room, walk
 from wearcap.apps.live.sink import Sink
-from wearcap.apps.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
+from wearcap.apps.live.status import Counts, DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
@@ -49,7 +49,6 @@ class Show:
             DeviceStatus("watch-7", 99.6, Rigid(wrists[0][frame].R, nowhere), 0.01, "left_wrist"),
             DeviceStatus("right_wrist", 0.0, Rigid(wrists[1][frame].R, wrists[1][frame].t), 4.2),
         )
-        counts = {"frames": self._frame, "dropped": 7, "late": 11, "gaps": 2, "floor_m": 0.0}
         return WearerStatus(
             name,
             self.stage,  # pyright: ignore[reportArgumentType]
@@ -57,9 +56,10 @@ class Show:
             self.progress,
             devices,
             Latency(41.0, 63.0, 88.0),
-            points_world=self.points,
-            notes=self.notes,
-            **counts,
+            Counts(frames=self._frame, dropped=7, late=11, gaps=2),
+            0.0,
+            self.points,
+            self.notes,
         )
 
     def record(self, on: bool) -> None:

@@ -12,6 +12,7 @@ from hps_walk import floor_points, hps_recording
 from hydra.utils import instantiate
 
 from wearcap.apps.live.capture import LiveCapture
+from wearcap.apps.live.setup import Known
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sources.replay import ReplaySource
 from wearcap.cli.conf import compose
@@ -39,7 +40,7 @@ def test_a_suit_and_a_localised_camera_become_registered_poses():
     system = instantiate(compose("capture", ["pipeline=hps", "recording=none"]).pipeline, _convert_="all")
     source, kept = ReplaySource(recording, HpsSession, math.inf), Kept()
     place = CaptureInput(recording, scan=Scan(floor_points()))
-    report = LiveCapture(system, [source], [kept], source=place, setup=source.setup).run(120.0)
+    report = LiveCapture(system, [source], [kept], source=place, known=Known(setup=source.setup)).run(120.0)
     motion = joined(kept.pieces)
     assert motion is not None and recording.motion is not None  # noqa: PT018
     frame = torch.searchsorted(recording.motion.timestamps, motion.timestamps - 1e-6)

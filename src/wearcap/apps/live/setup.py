@@ -66,6 +66,31 @@ class Setup:
         return replace(self, skeleton=skeleton_of_height(height_m, self.skeleton), notes=(*self.notes, note))
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of wearers before they come."""
+
+    setup: Setup | None = None
+    """Of everyone; None: the first minute finds it."""
+    height_m: float | None = None
+    hands: str = "grip"
+    """What hand poses are (`hand_seat`)."""
+    guided: bool = False
+    """Whether everyone begins with the guided first minute."""
+    file: Path | None = None
+    """Where what the first minute finds is kept; that of a named wearer, under the name beside it."""
+
+    def file_of(self, wearer: str) -> Path | None:
+        file = self.file
+        return file if file is None or not wearer else file.with_stem(f"{file.stem}_{plain_name(wearer)}")
+
+    def of(self, wearer: str) -> Setup | None:
+        """A wearer's set-up as far as it is known. Raises WearcapError as `read_setup` does."""
+        file = self.file_of(wearer)
+        setup = read_setup(file) if wearer and file is not None and file.is_file() else self.setup
+        return setup if setup is None or self.height_m is None else setup.with_height(self.height_m)
+
+
 def plain_name(wearer: str) -> str:
     """A wearer's name as part of a file's or folder's name: names from the network are no paths.
 

@@ -1,7 +1,7 @@
 """State of a running capture, as its page and its report show it, and what a page may ask of the capture."""
 
-from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -14,13 +14,15 @@ MAX_POINTS = 50_000
 """Most points of the surroundings in a status: the newest."""
 
 
-@dataclass(frozen=True)
-class Latency:
+class Latency(NamedTuple):
     """Quantiles (ms) of the time from a packet's device time to the pose that leaves; NaN before the first pose."""
 
-    median_ms: float = float("nan")
-    p95_ms: float = float("nan")
-    p99_ms: float = float("nan")
+    median: float = float("nan")
+    p95: float = float("nan")
+    p99: float = float("nan")
+
+
+NO_LATENCY = Latency()
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,29 @@ class DeviceStatus:
         return title if self.joint in (None, self.name) else f"{title} ({self.name})"
 
 
+@dataclass(frozen=True)
+class Counts:
+    """What has happened to one wearer's packets and poses so far."""
+
+    frames: int = 0
+    """Number of poses."""
+    sessions: int = 0
+    """How often the capture of this wearer began."""
+    dropped: int = 0
+    """Number of the head's poses that its session dropped as late, doubled or refused, and of all packets that were left out
+    because the capture was behind."""
+    late: int = 0
+    """Number of packets that came too late to be used."""
+    gaps: int = 0
+    """Number of gaps in the head's path, those that a capture left while it caught up among them."""
+    unknown: int = 0
+    """Number of packets of devices that nobody wears."""
+    clock_restarts: int = 0
+    """How often devices' clocks were set anew."""
+    refused: dict[str, int] = field(default_factory=dict)
+    """Samples that the sessions refused, by reason."""
+
+
 @dataclass(frozen=True, eq=False)
 class WearerStatus:
     """One wearer."""
@@ -58,16 +83,8 @@ class WearerStatus:
     progress: float = 0.0
     """Of the step, 0…1."""
     devices: tuple[DeviceStatus, ...] = ()
-    latency: Latency = Latency()
-    frames: int = 0
-    """Number of poses so far."""
-    dropped: int = 0
-    """Number of the head's poses that its session dropped as late, doubled or refused, and of all packets that were left out
-    because the capture was behind."""
-    late: int = 0
-    """Number of packets that came too late to be used."""
-    gaps: int = 0
-    """Number of gaps in the head's path, those that a capture left while it caught up among them."""
+    latency: Latency = NO_LATENCY
+    counts: Counts = Counts()
     floor_m: float | None = None
     """Floor height (m) in the head's world."""
     points_world: Float[Tensor, "point 3"] | None = None

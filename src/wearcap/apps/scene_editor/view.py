@@ -277,8 +277,7 @@ class ObjectPanel:
         if self.choice.options != names:
             self.choice.options = names
         chosen = current.name if current is not None else names[0]
-        if self.choice.value != chosen:
-            self.choice.value = chosen
+        self.choice.value = chosen
         kind = current.freedom.kind if current is not None else None
         for control in (self.name, self.rename, self.kind, self.delete):
             control.visible = current is not None
@@ -290,26 +289,20 @@ class ObjectPanel:
         if current is None:
             return
         freedom = current.freedom
-        _write(self.name, current.name)
-        _write(self.kind, FREEDOMS[freedom.kind])
+        self.name.value = current.name
+        self.kind.value = FREEDOMS[freedom.kind]
         if freedom.kind == "hinge":
             low, high = np.rad2deg(_limits(freedom, np.pi))
-            _write(self.least_deg, round(low))
-            _write(self.greatest_deg, round(high))
+            self.least_deg.value = round(low)
+            self.greatest_deg.value = round(high)
             self.try_deg.min, self.try_deg.max = float(low), float(max(high, low + 1.0))
         if freedom.axis is not None:
             low, high = _limits(freedom, 2.0)
-            _write(self.least_m, round(low, 3))
-            _write(self.greatest_m, round(high, 3))
-            _write(self.direction, round(float(np.rad2deg(np.arctan2(freedom.axis[1], freedom.axis[0])))))
+            self.least_m.value = round(low, 3)
+            self.greatest_m.value = round(high, 3)
+            self.direction.value = round(float(np.rad2deg(np.arctan2(freedom.axis[1], freedom.axis[0]))))
             self.try_m.min, self.try_m.max = float(low), float(max(high, low + 0.01))
 
 
 def _limits(freedom: Freedom, widest: float) -> tuple[float, float]:
     return (-widest, widest) if freedom.limits is None else freedom.limits
-
-
-def _write(control, value) -> None:
-    """Set a control's value only if it has changed: a control that is being dragged must not jump."""
-    if control.value != value:
-        control.value = value

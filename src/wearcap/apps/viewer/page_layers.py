@@ -1,7 +1,7 @@
 """Layers of the page; each moves to a time by sending poses, without resending meshes. Objects and contacts for pictures, too."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
@@ -49,6 +49,8 @@ class Layer(Protocol):
 
 class MotionLayer(Layer):
     """Layer of one motion, which can be shifted by an offset (m) and hidden; `handles` are its nodes."""
+
+    motion: Motion
 
     def __init__(self, *handles: viser.SceneNodeHandle):
         self.handles, self.offset = handles, np.zeros(3)
@@ -156,9 +158,7 @@ class FeetLayer(MotionLayer):
         touching = self.contact[nearest_frame(self.clock, time)]
         for ball, place, touch in zip(self.balls, places.double().numpy(), touching.tolist()):
             ball.position = place + self.offset
-            color = CONTACT_COLOR if touch else AIR_COLOR
-            if ball.color != color:
-                ball.color = color
+            ball.color = CONTACT_COLOR if touch else AIR_COLOR
 
 
 class HeadLayer:
@@ -405,6 +405,52 @@ class ObjectsLayer(MotionLayer):
     def show(self, time: float) -> None:
         for item, handle in zip(self.objects, self.handles):
             pose = poses_at(self.tracks.get(item.name), item, torch.tensor([time], dtype=torch.float64))[0]
-            wxyz, position = (quat_wxyz_from_matrix(pose.R.double()).numpy(), pose.t.double().numpy() + self.offset)
-            if not (np.array_equal(wxyz, handle.wxyz) and np.array_equal(position, handle.position)):
-                handle.wxyz, handle.position = wxyz, position
+            handle.wxyz = quat_wxyz_from_matrix(pose.R.double()).numpy()
+            handle.position = pose.t.double().numpy() + self.offset
+
+
+@dataclass
+class MotionLayers:
+    """Layers of one motion, which are shown, hidden, shifted and removed together."""
+
+    body: BodyLayer
+    feet: FeetLayer | None = None
+    label: LabelLayer | None = None
+    points: MotionLayer | None = None
+    objects: MotionLayer | None = None
+
+    @property
+    def layers(self) -> list[MotionLayer]:
+        """All but the label."""
+        every = (self.body, self.feet, self.points, self.objects)
+        return [layer for layer in every if layer is not None]
+
+    @property
+    def visible(self) -> bool:
+        return bool(self.body.handle.visible)
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool, named: bool = False) -> None:
+        """`named` also shows the motion's label, if it has one."""
+        for layer in self.layers:
+            layer.place(offset, visible)
+        if self.label is not None:
+            self.label.place(offset, named)
+
+    def show(self, time: float) -> None:
+        if self.visible:
+            for layer in (*self.layers, *([] if self.label is None else [self.label])):
+                layer.show(time)
+
+    def follow(self, motion: Motion) -> None:
+        """Show another motion of the same skeleton from now on."""
+        for layer in (self.body, self.feet, self.label):
+            if layer is not None:
+                layer.motion = motion
+        if self.feet is not None and motion.contact_prob is not None:
+            self.feet.contact, self.feet.clock = motion.contact_prob > 0.5, motion.timestamps
+
+    def remove(self) -> None:
+        """Remove the nodes."""
+        for layer in (*self.layers, *([] if self.label is None else [self.label])):
+            for handle in layer.handles:
+                handle.remove()

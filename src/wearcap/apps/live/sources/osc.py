@@ -105,6 +105,23 @@ _WITHOUT_GLOBAL_S = 0.5
 """Poses in the tracking space stand for missing ones in the world after so long."""
 
 
+@dataclass
+class _Tracker:
+    """State of one device of the protocol."""
+
+    global_s: float | None = None
+    """When its pose in the world was last seen, or its first in the tracking space."""
+    sent_s: float | None = None
+    """The sender's time (s) of its newest packet that has one."""
+
+    def wanted(self, local: bool, now_s: float) -> bool:
+        """Whether to use a pose: one in the tracking space only where the device has none in the world."""
+        if not local or self.global_s is None:
+            self.global_s = now_s
+            return not local
+        return now_s - self.global_s > _WITHOUT_GLOBAL_S
+
+
 class VmcSource(DatagramSource):
     """Head, controllers and trackers of VirtualMotionCapture and other senders of the VMC protocol."""
 
@@ -119,27 +136,24 @@ class VmcSource(DatagramSource):
     def __init__(self, address: Address):
         super().__init__(address)
         address.require_options()
-        self._names = Names()
+        self._head, self._trackers = _Tracker(), Names(lambda _: _Tracker())
         self._time_s: float | None = None
-        self._global_s: dict[str, float] = {}
-        """When a device's pose in the world was last seen, or its first in the tracking space."""
-        self._sent_s: dict[str, float | None] = {}
 
     def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
         here_s: float | None = None
-        poses: dict[str, tuple[Rigid | None, float | None]] = {}
+        poses: dict[str, tuple[_Tracker, Rigid | None, float | None]] = {}
         for address, arguments in osc_messages(data, self.known, refuse):
             if address == _VMC_TIME:
                 here_s = self._time(arguments, refuse)
             elif found := self._pose(address, arguments, arrived_s, refuse):
-                name, pose = found
-                poses[name] = (pose, self._time_s)
+                device, tracker, pose = found
+                poses[device] = (tracker, pose, self._time_s)
         packets = []
-        for name, (pose, sent_s) in poses.items():
+        for device, (tracker, pose, time_s) in poses.items():
             # A time in the datagram counts for all of it; an earlier one stands for one pose of each device.
-            sent_s = here_s if here_s is not None else None if sent_s == self._sent_s.get(name) else sent_s
-            self._sent_s[name] = sent_s if sent_s is not None else self._sent_s.get(name)
-            packets.append(_packet(self, name, sent_s, arrived_s, pose))
+            sent_s = here_s if here_s is not None else None if time_s == tracker.sent_s else time_s
+            tracker.sent_s = tracker.sent_s if sent_s is None else sent_s
+            packets.append(_packet(self, device, sent_s, arrived_s, pose))
         return packets
 
     def _time(self, arguments: list[Any], refuse: Callable[[str], None]) -> float | None:
@@ -153,36 +167,25 @@ class VmcSource(DatagramSource):
 
     def _pose(
         self, address: str, arguments: list[Any], arrived_s: float, refuse: Callable[[str], None]
-    ) -> tuple[str, Rigid | None] | None:
+    ) -> tuple[str, _Tracker, Rigid | None] | None:
         values = _floats(arguments[1:], 7)
         if values is None:
             return refuse(WRONG_ARGUMENTS)
-        head = address.startswith(_VMC_HEAD)
-        if not head and (fault := self._names.fault(arguments[0], arrived_s)):
-            return refuse(fault)
-        device = HEAD if head else device_of(arguments[0])
-        if not self._wanted(device, address.endswith(_LOCAL), arrived_s):
+        tracker, device = self._head, HEAD
+        if not address.startswith(_VMC_HEAD):
+            if fault := self._trackers.fault(arguments[0], arrived_s):
+                return refuse(fault)
+            tracker, device = self._trackers[arguments[0]], device_of(arguments[0])
+        if not tracker.wanted(address.endswith(_LOCAL), arrived_s):
             return None
         quat_wxyz = [values[6], *values[3:6]]
         if untracked(values[:3], quat_wxyz):
             refuse(UNTRACKED)
-            return (HEAD, None) if head else None
+            return (HEAD, tracker, None) if device == HEAD else None
         pose = pose_of(values[:3], quat_wxyz, "unity")
         if isinstance(pose, str):
             return refuse(pose)
-        return device, pose
-
-    def _wanted(self, device: str, local: bool, now_s: float) -> bool:
-        """Whether to use a pose: one in the tracking space only where the device has none in the world."""
-        if len(self._global_s) > 2 * self._names.limit:  # of devices that are long forgotten, too
-            self._global_s.clear()
-            self._sent_s.clear()
-        if not local:
-            self._global_s[device] = now_s
-        elif device not in self._global_s:
-            self._global_s[device] = now_s
-            return False
-        return not local or now_s - self._global_s[device] > _WITHOUT_GLOBAL_S
+        return device, tracker, pose
 
 
 def _packet(source: DatagramSource, device: str, sent_s: float | None, arrived_s: float, pose: Rigid | None) -> Packet:

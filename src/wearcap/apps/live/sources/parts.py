@@ -2,13 +2,14 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.apps.live.packets import CAMERA, HEAD, SUIT
+from wearcap.apps.live.recent import Entry, Recent
 from wearcap.body.skeleton import WRISTS
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.headset_axes import CONVENTIONS
@@ -18,8 +19,6 @@ MAX_NAME = 64
 """Characters of a device's or wearer's name."""
 MAX_NAMES = 64
 """Names that a source knows at once."""
-FORGOTTEN_S = 60.0
-"""A name that was silent for so long makes room for another."""
 UNIT_TOLERANCE = 0.02
 """Tolerance of a quaternion's length."""
 AXES = {"wearcap": torch.eye(3), **CONVENTIONS}
@@ -31,27 +30,18 @@ TOO_MANY_NAMES = "too many devices"
 BAD_NAME = "no name"
 
 
-class Names:
-    """Names that come from the network, bounded in number and length; a name that has been silent is forgotten."""
+class Names(Recent[Entry]):
+    """What a source keeps by names that come from the network, bounded in number and length."""
 
-    def __init__(self, limit: int = MAX_NAMES):
-        self.limit = limit
-        self._last_s: dict[str, float] = {}
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._last_s
+    def __init__(self, make: Callable[[str], Entry] = lambda name: None):
+        super().__init__(MAX_NAMES, make)
 
     def fault(self, name: object, now_s: float) -> str | None:
-        """Why a name cannot be used, or None."""
+        """Why a name cannot be used, or None: its entry is then there."""
         if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or not name.isprintable():
             return BAD_NAME
-        if name not in self._last_s and len(self._last_s) >= self.limit:
-            oldest = min(self._last_s, key=self._last_s.__getitem__)
-            if now_s - self._last_s[oldest] < FORGOTTEN_S:
-                return TOO_MANY_NAMES
-            del self._last_s[oldest]
-        self._last_s[name] = now_s
-        return None
+        self.admit(name, now_s)
+        return None if name in self else TOO_MANY_NAMES
 
 
 def device_of(serial: str) -> str:

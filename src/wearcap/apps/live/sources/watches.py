@@ -146,8 +146,7 @@ class WatchSource(DatagramSource):
         self.joint = address.options.get("joint")
         if self.joint is not None:
             require_choice(self.joint, WRISTS, f"joint={self.joint}")
-        self._names = Names()
-        self._watches: dict[str, _Watch] = {}
+        self._watches = Names(lambda _: _Watch())
         self._columns: list[str] = []
 
     own_options: tuple[str, ...] = ()
@@ -164,13 +163,10 @@ class WatchSource(DatagramSource):
                     packets.append(packet)
         return packets
 
-    def _watch(self, name: object, arrived_s: float, refuse: Callable[[str], None]) -> _Watch | None:
+    def _watch(self, name: Any, arrived_s: float, refuse: Callable[[str], None]) -> _Watch | None:
         """State of a device by its name; None for a name that cannot be used."""
-        if fault := self._names.fault(name, arrived_s):
-            return refuse(fault)
-        if len(self._watches) > 2 * self._names.limit:
-            self._watches = {each: watch for each, watch in self._watches.items() if each in self._names}
-        return self._watches.setdefault(str(name), _Watch())
+        fault = self._watches.fault(name, arrived_s)
+        return self._watches[name] if fault is None else refuse(fault)
 
     def _json_rows(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[tuple[str, _Row]]:
         """Samples by device: of Sensor Logger's message, or of SensorLog's objects, one or a list, or one a line."""
