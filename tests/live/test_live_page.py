@@ -200,7 +200,7 @@ def test_persons_have_their_own_colours_leave_and_come_back(page, show):
     page.take("anna", taller)
     page.draw(1.2)
     assert anna.layers.body.handle.visible
-    assert anna.skeleton is taller.skeleton
+    assert anna.layers.body.motion.skeleton is taller.skeleton
     page._panel.wearers["ben"].shown.value = False
     page.draw(1.3)
     assert not ben.layers.body.handle.visible

@@ -109,6 +109,7 @@ class LiveCapture:
             kind.tracks_wrists,
             kind.takes_objects,
             self._estimation,
+            any(source.patient for source in self.sources),
         )
         self.inbox = Inbox()
         self.wearers = Recent(MAX_WEARERS, self._new_wearer, self._is_captured)

@@ -5,7 +5,6 @@ It is a sink like any other: `take` only stores, a thread of the page's own draw
 
 import math
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -196,17 +195,14 @@ class LivePage(ServedPage, Sink):
 
     # --- drawing ---------------------------------------------------------------------------------------------------
 
-    def run(self, seconds: float = math.inf) -> None:
-        """Draw until stopped, or for the given seconds; what cannot be drawn is counted."""
-        begin = time.monotonic()
-        while not self._stopped and (now := time.monotonic()) - begin < seconds:
-            try:
-                self.draw(now)
-            except Exception as error:  # a frame that cannot be drawn must not end the page
-                self.errors += 1
-                self.last_error = f"{type(error).__name__}: {error}"[:200]
-            step_s = 1 / UPDATES_PER_S if self.server.get_clients() else UNSEEN_S
-            time.sleep(max(0.002, step_s - (time.monotonic() - now)))
+    def update(self, now_s: float) -> None:
+        """Draw; what cannot be drawn is counted."""
+        try:
+            self.draw(now_s)
+        except Exception as error:  # a frame that cannot be drawn must not end the page
+            self.errors += 1
+            self.last_error = f"{type(error).__name__}: {error}"[:200]
+        self.step_s = 1 / UPDATES_PER_S if self.server.get_clients() else UNSEEN_S
 
     def draw(self, now_s: float) -> None:
         """Send one frame."""

@@ -130,6 +130,8 @@ class Source(ABC):
     """Axes and units of what is received, as text for people."""
     lossless: ClassVar[bool] = False
     """Whether all that it delivers must be captured, however late the capture is."""
+    patient: ClassVar[bool] = False
+    """Whether its wearer stays while nothing comes."""
 
     def __init__(self, address: Address):
         """Listen at an address. Raises WearcapError for options that the source does not have."""

@@ -60,6 +60,8 @@ class Opener:
     takes_objects: bool
     estimation: Callable[[Setup | None, bool], SetupEstimation]
     """(set-up of last time, whether guided) → a new first minute."""
+    patient: bool = False
+    """Whether a wearer without packets stays: they come in pieces of any length."""
 
 
 @dataclass(eq=False)
@@ -285,7 +287,7 @@ class LiveWearer:
                 self.first.look(now_s)
                 self._align()
             return []
-        if now_s - self._heard_s > AWAY_S:
+        if now_s - self._heard_s > AWAY_S and not self.opener.patient:
             return self.leave()
         found = self._final(ended=False)
         if found is None:

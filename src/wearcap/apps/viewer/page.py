@@ -3,7 +3,7 @@
 Python runs the clock and sends poses; the browser skins, draws and moves the camera.
 """
 
-import time as wall
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -114,6 +114,8 @@ def _layers(
 class Page(ServedPage):
     """One recording's page. `run` plays until interrupted; `stop` closes the server."""
 
+    step_s = 1 / UPDATES_PER_S
+
     def __init__(
         self,
         recording: Recording,
@@ -155,6 +157,7 @@ class Page(ServedPage):
         if environment is not None:
             still = [item for item in environment.objects if item not in moving]
             self.layers.append(ObjectsLayer(self.server, "surroundings/objects", still, recording.object_motion))
+        self._updated_s, self._shown = math.inf, 0
         self.layout = BESIDE if len(self.bodies) - (TRUTH in self.bodies) > 1 else OVER
         floor_z = _floor_height(recording)
         self.server.scene.add_grid("/floor", infinite_grid=True, position=(0.0, 0.0, floor_z), fade_distance=25.0)
@@ -259,18 +262,14 @@ class Page(ServedPage):
                 return np.array(layer.frustum.position)
         return np.zeros(3)
 
-    def run(self, seconds: float = np.inf) -> None:
-        """Run the clock until interrupted, or for the given seconds."""
-        begin = last = wall.monotonic()
-        shown = 0
-        while not self._stopped and (now := wall.monotonic()) - begin < seconds:
-            if self.timeline.advance(now - last):
-                self.show()
-                shown += 1
-                if shown % 6 == 0:  # the slider need not be as smooth as the body
-                    self._show_time()
-            last = now
-            wall.sleep(max(0.0, 1 / UPDATES_PER_S - (wall.monotonic() - now)))
+    def update(self, now_s: float) -> None:
+        """Run the clock."""
+        elapsed_s, self._updated_s = now_s - min(self._updated_s, now_s), now_s
+        if self.timeline.advance(elapsed_s):
+            self.show()
+            self._shown += 1
+            if self._shown % 6 == 0:  # the slider need not be as smooth as the body
+                self._show_time()
 
 
 def _floor_height(recording: Recording) -> float:
