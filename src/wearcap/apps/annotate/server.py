@@ -129,7 +129,7 @@ class _Handler(Handler):
             raise Answer(HTTPStatus.NOT_FOUND, f"nothing to save at {path}")
         if self.headers.get_content_type() != "application/json":
             raise Answer(HTTPStatus.FORBIDDEN, "only this server's own page may save")
-        body = self.body(self.length(MAX_SAVE_BYTES))
+        body = self.body(MAX_SAVE_BYTES)
         try:
             sent = parse_json(body, "not a save", "message", schema=_Save)
         except WearcapError as error:

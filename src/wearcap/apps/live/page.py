@@ -257,10 +257,7 @@ class LivePage(ServedPage, Sink):
         self._points = points
         every = torch.cat([each[-MAX_POINTS:].cpu() for each in points])[-MAX_POINTS:] if points else torch.zeros(0, 3)
         every = every[every.isfinite().all(-1)]
-        if len(every):
-            add_points(self.server, PointCloud(every))
-        else:
-            self.server.scene.remove_by_name("/surroundings/points")
+        add_points(self.server, PointCloud(every))
 
     def _has_points(self, wearer: WearerStatus) -> bool:
         person = self._persons.get(wearer.name)

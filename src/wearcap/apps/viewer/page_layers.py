@@ -4,14 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 from urllib.parse import quote
 
 import numpy as np
 import torch
 import trimesh
 import viser
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from wearcap.apps.web.page_text import fitting
@@ -193,19 +193,26 @@ def by_height(
 def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
     """A point cloud coloured by height; a large one is subsampled evenly."""
     points = cloud.points_world[:: max(1, -(-len(cloud.points_world) // MAX_POINTS))].double().numpy()
+    low, high = np.quantile(points[:, 2], [0.02, 0.98]) if len(points) else (0.0, 1.0)
+    add_cloud(server.scene, "/surroundings/points", points, by_height(points, low, high).astype(np.uint8), 0.012)
+
+
+def add_cloud(
+    scene: viser.SceneApi,
+    name: str,
+    points: Float[np.ndarray, "point 3"],
+    colors: UInt8[np.ndarray, "point 3"],
+    size_m: float,
+    **look: Any,
+) -> None:
+    """Points of a size, in place of those of this name before; `look` is viser's."""
     if not len(points):
+        scene.remove_by_name(name)
         return
-    low, high = np.quantile(points[:, 2], [0.02, 0.98])
-    # Half precision is exact to a millimetre only near the node, so the node is in the points' middle.
-    centre = points.mean(0)
-    server.scene.add_point_cloud(
-        "/surroundings/points",
-        (points - centre).astype(np.float32),
-        by_height(points, low, high).astype(np.uint8),
-        point_size=0.012,
-        position=centre,
-        precision="float32",
-    )
+    # What the browser draws is exact to a millimetre only near the node, so the node is in the points' middle.
+    centre = points.mean(0, dtype=np.float64)
+    near = (points - centre).astype(np.float32)
+    scene.add_point_cloud(name, near, colors, point_size=size_m, precision="float32", position=centre, **look)
 
 
 _SCENES: dict[str, Callable[[Path], Mesh]] = {

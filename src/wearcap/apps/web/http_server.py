@@ -84,20 +84,16 @@ class Handler(BaseHTTPRequestHandler):
         except Answer as answer:
             self.send_error(answer.status, answer.why)
 
-    def length(self, most: int) -> int:
-        """Bytes of the request's body. Raises Answer where it has none, or a longer one."""
+    def body(self, most: int) -> bytes:
+        """The request's body. Raises Answer where it has none, or a longer one, and ConnectionError where less comes."""
         text = self.headers.get("Content-Length", "")
         if not (text.isascii() and text.isdecimal() and len(text) < 12) or "Transfer-Encoding" in self.headers:
             raise Answer(HTTPStatus.LENGTH_REQUIRED)
         if int(text) > most:
             raise Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a body of {text} bytes")
-        return int(text)
-
-    def body(self, length: int) -> bytes:
-        """The request's body. Raises ConnectionError where less comes."""
-        self._arriving.left = length
-        data = self.rfile.read(length)
-        if len(data) < length:
+        self._arriving.left = int(text)
+        data = self.rfile.read(int(text))
+        if len(data) < int(text):
             raise ConnectionError("the connection ended within a request")
         return data
 

@@ -19,7 +19,7 @@ from websockets.asyncio.server import Server, ServerConnection, broadcast
 from wearcap.apps.live.pacing import Pacing
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sinks.objects import SeenObject, objects_of
-from wearcap.apps.live.source import Address
+from wearcap.apps.live.source import Address, Addressed
 from wearcap.apps.web.connections import DELIVERING, SPOKEN
 from wearcap.apps.web.guard import LOOPBACK, Guard
 from wearcap.apps.web.sockets import LoopThread, serve_sockets
@@ -36,10 +36,10 @@ MAX_WAITING_BYTES = 1 << 20
 """Bytes that may wait for one client; a client that reads more slowly is disconnected."""
 
 
-class WebSocketSink(Sink):
+class WebSocketSink(Sink, Addressed):
     """Serves frames on an address; beyond loopback a client gives the token of the printed address."""
 
-    serves = True
+    port, serves = 9102, True
     convention = "JSON; wearcap's axes (x forward, y left, z up), metres, quaternions wxyz"
 
     def __init__(self, address: Address, pace: bool = True):

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 from wearcap.apps.live.setup import Setup
-from wearcap.apps.live.source import Address, Source
+from wearcap.apps.live.source import Source, addressed
 from wearcap.apps.live.sources.json_lines import JsonSource, WebSocketSource
 from wearcap.apps.live.sources.mvn import MvnSource
 from wearcap.apps.live.sources.osc import OscTrackerSource, VmcSource
 from wearcap.apps.live.sources.replay import ReplaySource
 from wearcap.apps.live.sources.watches import WatchHttpSource, WatchSource
-from wearcap.errors import WearcapError, nearest
+from wearcap.errors import WearcapError
 from wearcap.runtime.system import CaptureInput, System
 
 SOURCES: dict[str, type[Source]] = {
@@ -49,9 +49,5 @@ def source_of(text: str, host: str = "127.0.0.1") -> Source:
 
     Raises WearcapError for an unknown scheme, another text, and options that the source does not have.
     """
-    scheme, separator, _ = text.partition("://")
-    if scheme not in SOURCES:
-        what = f"no source is called {scheme[:40]!r}"
-        raise WearcapError(what, f"source={text[:80]}", "SCHEME://HOST:PORT", nearest(scheme, SOURCES))
-    source = SOURCES[scheme]
-    return source(Address.of(text if separator else f"{scheme}://", source.port, host))
+    source, address = addressed(text, SOURCES, "source", "source", lambda _: host)
+    return source(address)

@@ -43,13 +43,11 @@ class _Post(Handler):
         raise Answer(HTTPStatus.METHOD_NOT_ALLOWED, "a sensor app's messages are POSTed here")
 
     def _take(self) -> None:
-        source, length = self.server.source, self.length(MAX_BODY)
-        with self.server.lock:
-            if not source.budget.allows(length, self.place):
-                raise Answer(HTTPStatus.TOO_MANY_REQUESTS)
-        body = self.body(length)
+        source, body = self.server.source, self.body(MAX_BODY)
         self.place.rise(SPOKEN)
         with self.server.lock:
+            if not source.budget.allows(len(body), self.place):
+                raise Answer(HTTPStatus.TOO_MANY_REQUESTS)
             if source.understand(body, self.server.inbox, self.place):
                 self.place.rise(DELIVERING)
         self.send(b"")

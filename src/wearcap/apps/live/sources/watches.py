@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from wearcap.apps.live.packets import Inbox, Packet
-from wearcap.apps.live.source import Address, DatagramSource
+from wearcap.apps.live.source import Address, DatagramSource, Fault, counted, require
 from wearcap.apps.live.sources.parts import Names, device_of, matrix_of
 from wearcap.apps.live.sources.posts import serve_posts
 from wearcap.body.skeleton import WRISTS
@@ -107,13 +107,14 @@ class _Watch:
     whole: bool = False
     """Whether it sends whole samples, so that entries of single sensors are another device's, the phone's."""
 
-    def understood(self, row: _Row, refuse: Callable[[str], None]) -> WatchConvention | None:
+    def understood(self, row: _Row) -> WatchConvention | None:
         """The convention, once it is found; until then the sample is kept for that."""
         if self.convention is not None:
             length = math.hypot(*row.gravity) * abs(self.convention.m_s2)
             self.changed = 0 if G_M_S2 / OTHER_UNIT < length < G_M_S2 * OTHER_UNIT else self.changed + 1
             if self.changed < CHANGED_ROWS:
-                return self.convention if self.changed == 0 else refuse(NO_CONVENTION)
+                require(NO_CONVENTION if self.changed else None)
+                return self.convention
             self.convention, self.changed, self.rows = None, 0, []
         step_s = row.time_s - self.rows[-1].time_s if self.rows else 0.01
         if not 0 < step_s <= FIRST_S:  # late, repeated, or of another time
@@ -129,8 +130,8 @@ class _Watch:
         try:
             gravity, quat_wxyz = (np.array([getattr(each, name) for each in rows]) for name in ("gravity", "quat_wxyz"))
             self.convention = watch_convention(gravity, quat_wxyz, "watch")
-        except WearcapError:
-            refuse(NO_CONVENTION)
+        except WearcapError as error:
+            raise Fault(NO_CONVENTION) from error
         return self.convention
 
 
@@ -140,33 +141,21 @@ class WatchSource(DatagramSource):
     scheme, port, hz = "watch", 5555, 100.0
     convention = "SensorLog's CSV or JSON, Sensor Logger's JSON; g or m/s², either sign: found in the first second"
 
+    own_options = ("joint",)
+
     def __init__(self, address: Address):
         super().__init__(address)
-        address.require_options("joint", *self.own_options)
         self.joint = address.options.get("joint")
         if self.joint is not None:
             require_choice(self.joint, WRISTS, f"joint={self.joint}")
         self._watches = Names(lambda _: _Watch())
         self._columns: list[str] = []
 
-    own_options: tuple[str, ...] = ()
-
-    def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
-        packets: list[Packet] = []
-        if data.lstrip()[:1] in (b"{", b"["):
-            found = self._json_rows(data, arrived_s, refuse)
-        else:
-            found = self._csv_rows(data, refuse)
-        for name, row in found:
+    def packets(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[Packet | None]:
+        json = data.lstrip()[:1] in (b"{", b"[")
+        for name, row in self._json_rows(data, arrived_s, refuse) if json else self._csv_rows(data, refuse):
             with _refusing(refuse):
-                if packet := self._packet(name, row, arrived_s, refuse):
-                    packets.append(packet)
-        return packets
-
-    def _watch(self, name: Any, arrived_s: float, refuse: Callable[[str], None]) -> _Watch | None:
-        """State of a device by its name; None for a name that cannot be used."""
-        fault = self._watches.fault(name, arrived_s)
-        return self._watches[name] if fault is None else refuse(fault)
+                yield self._packet(name, row, arrived_s)
 
     def _json_rows(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[tuple[str, _Row]]:
         """Samples by device: of Sensor Logger's message, or of SensorLog's objects, one or a list, or one a line."""
@@ -177,7 +166,8 @@ class WatchSource(DatagramSource):
                 refuse(NO_SAMPLE)
                 continue
             if isinstance(content, dict) and isinstance(content.get("payload"), list):
-                yield from self._sensor_logger(content, arrived_s, refuse)
+                with counted(refuse):
+                    yield from self._sensor_logger(content, arrived_s, refuse)
                 continue
             for entry in content[:MAX_ENTRIES] if isinstance(content, list) else [content]:
                 with _refusing(refuse):
@@ -188,10 +178,7 @@ class WatchSource(DatagramSource):
         self, content: dict[str, Any], arrived_s: float, refuse: Callable[[str], None]
     ) -> Iterator[tuple[str, _Row]]:
         name = content.get("deviceId") or "watch"
-        watch = self._watch(name, arrived_s, refuse)
-        if watch is None:
-            return
-        entries = []
+        watch, entries = self._watches.entry(name, arrived_s), []
         for entry in content["payload"][:MAX_ENTRIES]:
             with _refusing(refuse):
                 sensor = entry["name"].lower().replace(" ", "").replace("_", "")
@@ -225,26 +212,19 @@ class WatchSource(DatagramSource):
                     yield values.get("deviceID") or values.get("deviceName") or "watch", _sensor_log(values.get)
         return None
 
-    def _packet(self, name: str, row: _Row, arrived_s: float, refuse: Callable[[str], None]) -> Packet | None:
+    def _packet(self, name: str, row: _Row, arrived_s: float) -> Packet | None:
         """A device's sample in wearcap's terms."""
-        watch = self._watch(name, arrived_s, refuse)
-        if watch is None:
-            return None
-        if fault := time_fault(row.time_s):
-            return refuse(fault)
-        R = matrix_of(row.quat_wxyz)
-        if isinstance(R, str):
-            return refuse(R)
-        felt = (*row.gravity, *row.free)
+        watch = self._watches.entry(name, arrived_s)
+        require(time_fault(row.time_s))
+        R, felt = matrix_of(row.quat_wxyz), (*row.gravity, *row.free)
         if not all(abs(value) <= MAX_ACC_M_S2 for value in felt):
-            return refuse(OUT_OF_RANGE if all(map(math.isfinite, felt)) else NOT_FINITE)
-        convention = watch.understood(row, refuse)
+            raise Fault(OUT_OF_RANGE if all(map(math.isfinite, felt)) else NOT_FINITE)
+        convention = watch.understood(row)
         if convention is None:
             return None
         R = R.T.contiguous() if convention.back else R
         acc_world = R @ (convention.m_s2 * torch.tensor(row.free))
-        if fault := values_fault(acc_world, (3,), MAX_ACC_M_S2):
-            return refuse(fault)
+        require(values_fault(acc_world, (3,), MAX_ACC_M_S2))
         device = self.joint or device_of(name)
         sample = WatchSample(row.time_s, R, acc_world, device)
         return Packet(self.wearer, device, f"{self.name}/{name}", row.time_s, arrived_s, sample)
@@ -254,7 +234,7 @@ class WatchHttpSource(WatchSource):
     """The same over HTTP: each POST is a message. `token=…` in the address must then be in the app's, too."""
 
     scheme, port = "watch+http", 8000
-    own_options = ("token",)
+    own_options = ("joint", "token")
 
     async def run(self, inbox: Inbox) -> None:
         await serve_posts(self, self.address.options.get("token"), inbox)
@@ -277,7 +257,8 @@ _VALUES: Mapping[str, tuple[str, ...]] = {
 def _refusing(refuse: Callable[[str], None]) -> Iterator[None]:
     """What is no sample is counted, and the next one looked at."""
     try:
-        yield
+        with counted(refuse):
+            yield
     except (WearcapError, ValueError, TypeError, LookupError, OverflowError, AttributeError):
         refuse(NO_SAMPLE)
 
