@@ -42,7 +42,7 @@ from wearcap.apps.live.packets import Inbox, Packet  # noqa: E402
 from wearcap.apps.live.source import Budget, DatagramSource  # noqa: E402
 from wearcap.apps.live.sources import SOURCES, source_of  # noqa: E402
 from wearcap.apps.live.sources.parts import MAX_NAME  # noqa: E402
-from wearcap.apps.live.sources.posts import _Posts  # noqa: E402
+from wearcap.apps.live.sources.watches import _Posts  # noqa: E402
 from wearcap.apps.web.connections import Connection, Connections  # noqa: E402
 from wearcap.apps.web.guard import Guard  # noqa: E402
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, pose_fault, time_fault, values_fault  # noqa: E402

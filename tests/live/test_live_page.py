@@ -11,10 +11,10 @@ import torch
 
 from carried_box import boxes
 from live_show import FPS, PIECE, Show, walking
+from wearcap.apps.live.pacing import BEHIND_S, Playout
 from wearcap.apps.live.page import MAX_WEARERS, LivePage
 from wearcap.apps.live.page_devices import Devices
 from wearcap.apps.live.page_panel import sinks_html, wearer_html
-from wearcap.apps.live.playout import BEHIND_S, Playout
 from wearcap.apps.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.apps.viewer.page import COLORS
 from wearcap.body.skeleton import skeleton_of_height

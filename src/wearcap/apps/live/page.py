@@ -13,10 +13,10 @@ import torch
 import viser
 from torch import Tensor
 
+from wearcap.apps.live.pacing import Playout
 from wearcap.apps.live.packets import HEAD
 from wearcap.apps.live.page_devices import Devices
 from wearcap.apps.live.page_panel import Panel
-from wearcap.apps.live.playout import Playout
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.status import MAX_POINTS, LiveControls, LiveStatus, WearerStatus
 from wearcap.apps.viewer.page import COLORS, UPDATES_PER_S

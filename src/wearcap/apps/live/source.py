@@ -4,7 +4,7 @@ import asyncio
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeVar
@@ -250,20 +250,29 @@ class DatagramSource(Source):
         return bool(packets)
 
     async def run(self, inbox: Inbox) -> None:
-        loop = asyncio.get_running_loop()
         try:
-            transport, _ = await loop.create_datagram_endpoint(
-                lambda: _Receiver(self, inbox), local_addr=(self.address.host, self.address.port)
-            )
+            end = await self.listen(inbox)
         except OSError as error:
             raise self.cannot_listen(error) from error
         self.listens = True
-        endpoint: socket.socket = transport.get_extra_info("socket")
-        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         try:
             await asyncio.Event().wait()
         finally:
+            await end()
+
+    async def listen(self, inbox: Inbox) -> Callable[[], Awaitable[None]]:
+        """Begin to deliver what comes; returns what ends it. Raises OSError when the address cannot be used."""
+        loop = asyncio.get_running_loop()
+        transport, _ = await loop.create_datagram_endpoint(
+            lambda: _Receiver(self, inbox), local_addr=(self.address.host, self.address.port)
+        )
+        endpoint: socket.socket = transport.get_extra_info("socket")
+        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+
+        async def end() -> None:
             transport.close()
+
+        return end
 
 
 class _Receiver(asyncio.DatagramProtocol):

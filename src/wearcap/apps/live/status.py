@@ -1,8 +1,10 @@
 """State of a running capture, as its page and its report show it, and what a page may ask of the capture."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -23,6 +25,32 @@ class Latency(NamedTuple):
 
 
 NO_LATENCY = Latency()
+_BIN_MS, _LONGEST_MS = 0.5, 20_000.0
+
+
+class Latencies:
+    """Latencies of poses, as many as there are, in bounded memory: a histogram."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._bins = np.zeros(int(_LONGEST_MS / _BIN_MS) + 1, dtype=np.int64)
+
+    def add(self, seconds: Float[np.ndarray, "pose"]) -> None:
+        """Count some latencies (s); negative ones count as 0, those beyond 20 s as 20 s."""
+        bins = np.clip(1000.0 * seconds / _BIN_MS, 0, len(self._bins) - 1).astype(np.int64)
+        np.add.at(self._bins, bins, 1)
+        self.count += len(bins)
+
+    def quantile_ms(self, share: float) -> float:
+        """Smallest latency (ms) that a share of the poses does not exceed, rounded up to half a millisecond."""
+        if not self.count:
+            return math.nan
+        reached = np.searchsorted(self._bins.cumsum(), share * self.count)
+        return float(_BIN_MS * (reached + 1))
+
+    @property
+    def quantiles(self) -> Latency:
+        return Latency(*(self.quantile_ms(share) for share in (0.5, 0.95, 0.99)))
 
 
 @dataclass(frozen=True, eq=False)

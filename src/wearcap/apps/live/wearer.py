@@ -12,12 +12,11 @@ from torch import Tensor
 
 from wearcap.apps.live.clocks import Clocks
 from wearcap.apps.live.devices import MAX_DEVICES, Device
-from wearcap.apps.live.latency import Latencies
 from wearcap.apps.live.packets import HEAD, SUIT, Packet
 from wearcap.apps.live.recent import Recent
 from wearcap.apps.live.setup import Setup
 from wearcap.apps.live.setup_estimation import SetupEstimation
-from wearcap.apps.live.status import MAX_POINTS, Counts, Stage, WearerStatus
+from wearcap.apps.live.status import MAX_POINTS, Counts, Latencies, Stage, WearerStatus
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation

@@ -47,6 +47,11 @@ class Guard:
     open: bool = False
     """Whether requests need no token, only the right name and no foreign page."""
 
+    @classmethod
+    def of(cls, host: str, token: str | None) -> "Guard":
+        """A guard with a given token; without one, requests need none."""
+        return cls(host, open=True) if token is None else cls(host, token)
+
     def url(self, port: int) -> str:
         """The address to open, with the token."""
         name = _plain(self.host)

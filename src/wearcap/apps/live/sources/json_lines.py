@@ -11,7 +11,7 @@
 import asyncio
 import contextlib
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -197,25 +197,21 @@ class WebSocketSource(JsonSource):
     def url(self) -> str:
         return f"{super().url}/" + (f"?token={self.token}" if self.token else "")
 
-    async def run(self, inbox: Inbox) -> None:
-        guard = Guard(self.address.host, self.token) if self.token else Guard(self.address.host, open=True)
-        try:
-            server = await serve_sockets(
-                lambda connection: self._listen(connection, inbox),
-                self.address.host,
-                self.address.port,
-                guard,
-                lambda why: inbox.refuse(self.name, why),
-                MAX_POINTS_MESSAGE,
-            )
-        except OSError as error:
-            raise self.cannot_listen(error) from error
-        self.listens = True
-        try:
-            await asyncio.Event().wait()
-        finally:
+    async def listen(self, inbox: Inbox) -> Callable[[], Awaitable[None]]:
+        server = await serve_sockets(
+            lambda connection: self._listen(connection, inbox),
+            self.address.host,
+            self.address.port,
+            Guard.of(self.address.host, self.token or None),
+            lambda why: inbox.refuse(self.name, why),
+            MAX_POINTS_MESSAGE,
+        )
+
+        async def end() -> None:
             server.close()
             await server.wait_closed()
+
+        return end
 
     async def _listen(self, connection: Any, inbox: Inbox) -> None:
         """Deliver what one adapter sends."""

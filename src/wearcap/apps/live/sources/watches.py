@@ -5,11 +5,14 @@ direction are found in the first second of a device's samples, as `io.devices.wa
 Sensor Logger sends a phone's sensors as entries of their own, which are paired by time; a watch's come together.
 """
 
+import asyncio
 import math
+import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +21,9 @@ import torch
 from wearcap.apps.live.packets import Inbox, Packet
 from wearcap.apps.live.source import Address, DatagramSource, Fault, counted, require
 from wearcap.apps.live.sources.parts import Names, device_of, matrix_of
-from wearcap.apps.live.sources.posts import serve_posts
+from wearcap.apps.web.connections import DELIVERING, SPOKEN
+from wearcap.apps.web.guard import Guard
+from wearcap.apps.web.http_server import Answer, Handler, HttpServer
 from wearcap.body.skeleton import WRISTS
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError, require_choice
@@ -28,7 +33,7 @@ from wearcap.sensors.samples import WatchSample
 
 MAX_ENTRIES = 4096
 """Samples or sensors' entries of one message."""
-MAX_COLUMNS = 256
+MAX_COLUMNS, MAX_BODY = 256, 1 << 20
 FIRST_S, FIRST_ROWS, MAX_ROWS = 1.0, 10, 512
 """Length of what a convention is found in (s), and its least and largest number of samples."""
 PAIR_S = 0.02
@@ -236,8 +241,55 @@ class WatchHttpSource(WatchSource):
     scheme, port = "watch+http", 8000
     own_options = ("joint", "token")
 
-    async def run(self, inbox: Inbox) -> None:
-        await serve_posts(self, self.address.options.get("token"), inbox)
+    async def listen(self, inbox: Inbox) -> Callable[[], Awaitable[None]]:
+        server = _Posts(self, Guard.of(self.address.host, self.address.options.get("token")), inbox)
+        return lambda: asyncio.to_thread(server.stop)
+
+
+class _Posts(HttpServer):
+    """Gives a source what is posted, one message at a time."""
+
+    def __init__(self, source: DatagramSource, guard: Guard, inbox: Inbox):
+        self.source, self.inbox, self.lock = source, inbox, threading.Lock()
+        super().__init__(source.address.host, source.address.port, _Post, guard)
+
+    def refuse(self, why: str) -> None:
+        self.inbox.refuse(self.source.name, why)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        self.refuse("broken connection")
+
+
+class _Post(Handler):
+    server: _Posts  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def do_POST(self) -> None:
+        self.answer(self._take)
+
+    def do_GET(self) -> None:
+        self.answer(self._refuse)
+
+    do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
+
+    def _refuse(self) -> None:
+        raise Answer(HTTPStatus.METHOD_NOT_ALLOWED, "a sensor app's messages are POSTed here")
+
+    def _take(self) -> None:
+        source, body = self.server.source, self.body(MAX_BODY)
+        self.place.rise(SPOKEN)
+        with self.server.lock:
+            if not source.budget.allows(len(body), self.place):
+                raise Answer(HTTPStatus.TOO_MANY_REQUESTS)
+            if source.understand(body, self.server.inbox, self.place):
+                self.place.rise(DELIVERING)
+        self.send(b"")
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        self.server.refuse(HTTPStatus(code).phrase.lower())
+        super().send_error(code, message, explain)
+
+    def log_error(self, format: str, *args: Any) -> None:
+        self.server.refuse("broken connection")
 
 
 _VALUES: Mapping[str, tuple[str, ...]] = {
