@@ -8,7 +8,7 @@ import torch
 
 from walking_person import SEAT, room, walk
 from wearcap.apps.live.sink import Sink
-from wearcap.apps.live.status import Counts, DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
+from wearcap.apps.live.status import Ask, Counts, DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
@@ -66,16 +66,12 @@ class Show:
         self.asked.append(("record", on))
         self.recording = "recordings/walk" if on else None
 
-    def guide(self, wearer: str) -> None:
-        self.asked.append(("guide", wearer))
-        self.stage, self.step, self.progress = "first minute", "Stand still and look straight ahead.", 0.4
-
-    def skip(self, wearer: str) -> None:
-        self.asked.append(("skip", wearer))
-        self.step, self.progress = "Let your arms hang. The left watch still moves.", 0.1
-
-    def redo(self, wearer: str) -> None:
-        self.asked.append(("redo", wearer))
+    def ask(self, action: Ask, wearer: str) -> None:
+        self.asked.append((action, wearer))
+        if action == "guide":
+            self.stage, self.step, self.progress = "first minute", "Stand still and look straight ahead.", 0.4
+        elif action == "skip":
+            self.step, self.progress = "Let your arms hang. The left watch still moves.", 0.1
 
     def stop(self) -> None:
         self.asked.append(("stop",))

@@ -22,7 +22,7 @@ from wearcap.apps.live.setup_estimation import SetupEstimation
 from wearcap.apps.live.sink import Sink, SinkThread
 from wearcap.apps.live.sinks.files import FilesSink
 from wearcap.apps.live.source import Source
-from wearcap.apps.live.status import LiveStatus
+from wearcap.apps.live.status import Ask, LiveStatus
 from wearcap.apps.live.wearer import LiveWearer, Opener
 from wearcap.apps.web.sockets import LoopThread
 from wearcap.body.skeleton import xsens23
@@ -311,36 +311,23 @@ class LiveCapture:
         """Start or stop recording."""
         self._wish(lambda: self._start_recording(None) if on else self._stop_recording())
 
-    def guide(self, wearer: str) -> None:
-        """Begin the guided first minute of a wearer, anew where there was one."""
+    def ask(self, action: Ask, wearer: str) -> None:
+        """Do something about a wearer's first minute."""
 
         def fulfil() -> None:
-            if (known := self.wearers.get(wearer)) is not None:
+            known = self.wearers.get(wearer)
+            if known is not None and action == "guide":
                 self._send(known, known.leave())
                 known.guide()
+            elif known is not None and known.first is not None:
+                getattr(known.first, action)()
 
         self._wish(fulfil)
-
-    def skip(self, wearer: str) -> None:
-        """Go on to the next step of the first minute, with defaults for this one."""
-        self._first(wearer, "skip")
-
-    def redo(self, wearer: str) -> None:
-        """Begin the step of the first minute again."""
-        self._first(wearer, "redo")
 
     def stop(self) -> None:
         """End the capture."""
         self._stopping.set()
         self.inbox.wake()
-
-    def _first(self, wearer: str, action: str) -> None:
-        def fulfil() -> None:
-            first = self.wearers[wearer].first if wearer in self.wearers else None
-            if first is not None:
-                getattr(first, action)()
-
-        self._wish(fulfil)
 
     def _wish(self, wish: Callable[[], None]) -> None:
         self._wishes.append(wish)

@@ -93,9 +93,9 @@ class WearerFolder:
             self.redo = gui.add_button("Redo", visible=False, hint="Begin this step again")
             self.guide = gui.add_button("Guide me", hint="Height, floor and seats of the devices, step by step")
             self.numbers = gui.add_html("")
-        self.guide.on_click(lambda _: controls.guide(name))
-        self.skip.on_click(lambda _: controls.skip(name))
-        self.redo.on_click(lambda _: controls.redo(name))
+        self.guide.on_click(lambda _: controls.ask("guide", name))
+        self.skip.on_click(lambda _: controls.ask("skip", name))
+        self.redo.on_click(lambda _: controls.ask("redo", name))
 
     def update(self, wearer: WearerStatus, behind_s: float) -> None:
         """Show a state; viser sends what has changed."""

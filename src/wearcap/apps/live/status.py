@@ -147,6 +147,11 @@ class LiveStatus:
     """Time since it started."""
 
 
+Ask = Literal["guide", "skip", "redo"]
+"""Begin a guided first minute, anew where there was one; go on to its next step, with defaults for this one; begin this step
+again."""
+
+
 @runtime_checkable
 class LiveControls(Protocol):
     """What a page asks of the capture; every method returns at once and may be called from any thread."""
@@ -156,14 +161,8 @@ class LiveControls(Protocol):
     def record(self, on: bool) -> None:
         """Start or stop recording."""
 
-    def guide(self, wearer: str) -> None:
-        """Begin the guided first minute of a wearer, anew where there was one."""
-
-    def skip(self, wearer: str) -> None:
-        """Go on to the next step, with defaults for this one."""
-
-    def redo(self, wearer: str) -> None:
-        """Begin the step again."""
+    def ask(self, action: Ask, wearer: str) -> None:
+        """Do something about a wearer's first minute."""
 
     def stop(self) -> None:
         """End the capture."""
