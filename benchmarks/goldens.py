@@ -42,7 +42,7 @@ from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.systems.echo.stream import EchoStream
 from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
-from wearcap.systems.hps.stream import follow
+from wearcap.systems.hps.stream import HpsSession
 from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample
 from wearcap.training.loggers import read_metrics
 
@@ -356,7 +356,12 @@ def echo_streamed() -> Motion | None:
 
 def hps_streamed() -> Motion | None:
     pipeline, recording, place = _pipeline("hps_without_scene", "hps", "pipeline.synchronization.clock=shared")
-    return joined(list(follow(pipeline, _pieces(recording, 4.0), None, Path(place).parent)))
+    pieces, motions = _pieces(recording, 4.0), []
+    session = HpsSession(pipeline, [recording], None)
+    for piece in pieces:
+        session.push([[HpsSession.of_piece(pipeline, piece, Path(place).parent, None)]])
+        motions += session.poses()
+    return joined([motion for motion in (*motions, *session.poses(ended=True)) if motion is not None])
 
 
 def _pieces(recording: Recording, seconds: float) -> Iterator[Recording]:

@@ -11,14 +11,16 @@ beyond 16 MiB or, of Python's own, 256 KiB.
 """
 
 import argparse
-import asyncio
+import contextlib
 import gc
 import json
 import math
 import os
 import random
+import socket
 import struct
 import sys
+import threading
 import time
 import tracemalloc
 from collections import Counter
@@ -37,7 +39,9 @@ from wearcap.apps.live.packets import Inbox, Packet
 from wearcap.apps.live.source import Budget, DatagramSource
 from wearcap.apps.live.sources import SOURCES, source_of
 from wearcap.apps.live.sources.parts import MAX_NAME
-from wearcap.apps.live.sources.posts import MAX_HEADER, _Connections
+from wearcap.apps.live.sources.watches import _Posts
+from wearcap.apps.web.connections import Connection, Connections
+from wearcap.apps.web.guard import Guard
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, pose_fault, time_fault, values_fault
 from wearcap.sensors.samples import (
     ActiveObject,
@@ -137,31 +141,23 @@ def fault_of(packet: Packet) -> str | None:
     return "sample"
 
 
-class _Answers:
-    """Stands for a connection's writer."""
-
-    def __init__(self) -> None:
-        self.written = 0
-
-    def write(self, data: bytes) -> None:
-        self.written += len(data)
-
-    async def drain(self) -> None: ...
-
-    def close(self) -> None: ...
+def _say(connection: socket.socket, data: bytes) -> None:
+    """Send all of it, as far as somebody listens, and nothing more."""
+    with contextlib.suppress(OSError):
+        connection.sendall(data)
+        connection.shutdown(socket.SHUT_WR)
 
 
 class Fed:
     """A source that is given packets, and what came of them."""
 
     def __init__(self, name: str):
-        self.name, self.source, self.inbox = name, source_of(f"{name}://127.0.0.1"), Inbox()
+        self.name, self.source, self.inbox = name, source_of(f"{name}://127.0.0.1:0"), Inbox()
         assert isinstance(self.source, DatagramSource)
         self.now_s = 1000.0
         self.delivered: Counter[str] = Counter()
         self.faults: Counter[str] = Counter()
-        self._connections = _Connections(self.source, None, self.inbox)
-        self._loop = asyncio.new_event_loop()
+        self._posts = _Posts(self.source, Guard("127.0.0.1", open=True), self.inbox)
 
     def give(self, data: bytes, step_s: float = 0.004) -> int:
         """Give a packet; its processor time (ns)."""
@@ -169,7 +165,7 @@ class Fed:
         begin = time.thread_time_ns()
         try:
             if self.name == "watch+http":
-                self._loop.run_until_complete(self._connect(data))
+                self._connect(data)
                 packets = self.inbox.wait(0)
             else:
                 packets = self.source.parse(data, self.now_s, lambda why: self.inbox.refuse(self.name, why))  # type: ignore[attr-defined]
@@ -183,13 +179,16 @@ class Fed:
                 self.faults[f"invalid sample: {fault}"] += 1
         return spent
 
-    async def _connect(self, data: bytes) -> None:
+    def _connect(self, data: bytes) -> None:
         """A connection of its own for the bytes."""
         self.source.budget = Budget(parse_s=math.inf)  # the rate limit is not what is tried here
-        reader, writer = asyncio.StreamReader(MAX_HEADER), _Answers()
-        reader.feed_data(data)
-        reader.feed_eof()
-        await self._connections.serve(reader, writer)  # type: ignore[arg-type]
+        ours, theirs = socket.socketpair()
+        self._posts.places[ours] = Connection(Connections(1), lambda: None)
+        sender = threading.Thread(target=_say, args=(theirs, data))
+        sender.start()
+        self._posts.process_request_thread(ours, None)
+        theirs.close()
+        sender.join()
 
 
 def rss_mib() -> float:

@@ -8,7 +8,7 @@ import torch
 
 from walking_person import SEAT, room, walk
 from wearcap.apps.live.sink import Sink
-from wearcap.apps.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
+from wearcap.apps.live.status import Ask, Counts, DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
@@ -49,7 +49,6 @@ class Show:
             DeviceStatus("watch-7", 99.6, Rigid(wrists[0][frame].R, nowhere), 0.01, "left_wrist"),
             DeviceStatus("right_wrist", 0.0, Rigid(wrists[1][frame].R, wrists[1][frame].t), 4.2),
         )
-        counts = {"frames": self._frame, "dropped": 7, "late": 11, "gaps": 2, "floor_m": 0.0}
         return WearerStatus(
             name,
             self.stage,  # pyright: ignore[reportArgumentType]
@@ -57,25 +56,22 @@ class Show:
             self.progress,
             devices,
             Latency(41.0, 63.0, 88.0),
-            points_world=self.points,
-            notes=self.notes,
-            **counts,
+            Counts(frames=self._frame, dropped=7, late=11, gaps=2),
+            0.0,
+            self.points,
+            self.notes,
         )
 
     def record(self, on: bool) -> None:
         self.asked.append(("record", on))
         self.recording = "recordings/walk" if on else None
 
-    def guide(self, wearer: str) -> None:
-        self.asked.append(("guide", wearer))
-        self.stage, self.step, self.progress = "first minute", "Stand still and look straight ahead.", 0.4
-
-    def skip(self, wearer: str) -> None:
-        self.asked.append(("skip", wearer))
-        self.step, self.progress = "Let your arms hang. The left watch still moves.", 0.1
-
-    def redo(self, wearer: str) -> None:
-        self.asked.append(("redo", wearer))
+    def ask(self, action: Ask, wearer: str) -> None:
+        self.asked.append((action, wearer))
+        if action == "guide":
+            self.stage, self.step, self.progress = "first minute", "Stand still and look straight ahead.", 0.4
+        elif action == "skip":
+            self.step, self.progress = "Let your arms hang. The left watch still moves.", 0.1
 
     def stop(self) -> None:
         self.asked.append(("stop",))

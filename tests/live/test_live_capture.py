@@ -30,7 +30,7 @@ from watched_walk import drawn_pipeline, watched_walk
 from wearcap.apps.live import wearer as wearer_module
 from wearcap.apps.live.capture import LiveCapture, report_text
 from wearcap.apps.live.packets import HEAD, Inbox, Packet
-from wearcap.apps.live.setup import Seat, Setup, plain_name
+from wearcap.apps.live.setup import Known, Seat, Setup, plain_name
 from wearcap.apps.live.sink import Sink, SinkThread
 from wearcap.apps.live.sinks import sink_of
 from wearcap.apps.live.sinks.files import FilesSink, join_sections
@@ -101,7 +101,7 @@ def carried() -> Recording:
 def replayed(system, recording: Recording, *sinks: Sink, speed: float = math.inf) -> tuple[Motion, dict]:
     """What a replay gives, and its report."""
     kept, source = Kept(), ReplaySource(recording, system.session_class(), speed)
-    capture = LiveCapture(system, [source], [kept, *sinks], setup=source.setup)
+    capture = LiveCapture(system, [source], [kept, *sinks], known=Known(setup=source.setup))
     report = capture.run(60.0)
     return kept.motion(), report
 
@@ -169,7 +169,7 @@ def test_a_wearer_who_leaves_and_comes_back_begins_anew(monkeypatch):
         (packet._replace(arrived_s=now_s + (1000.0 if k >= 120 else 0.0)), pause)
         for k, (packet, pause) in enumerate(script)
     ]
-    report = LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup=setup).run(30.0)
+    report = LiveCapture(small_hmd2(), [Scripted(script)], [kept], known=Known(setup=setup)).run(30.0)
     assert kept.left == [""]
     assert report["wearers"]["wearer"]["frames"] == 2 * 120
     torch.testing.assert_close(kept.pieces[""][-1].timestamps[-1].item(), 5.0 + 119 / 60)
@@ -179,7 +179,9 @@ def test_two_wearers_have_their_own_clocks_and_motion():
     first, second = swaying(100), swaying(100)
     script = [pair for both in zip(heads(first, "anna"), heads(second, "ben")) for pair in both]
     kept = Kept()
-    LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup=ReplaySource(first, HMD2Session).setup).run(30.0)
+    LiveCapture(
+        small_hmd2(), [Scripted(script)], [kept], known=Known(setup=ReplaySource(first, HMD2Session).setup)
+    ).run(30.0)
     torch.testing.assert_close(kept.motion("anna").T_world_joint.t, kept.motion("ben").T_world_joint.t)
     assert len(kept.motion("anna")) == 100
 
@@ -441,9 +443,7 @@ def test_a_client_that_does_not_read_is_disconnected_and_the_others_get_all():
 def test_the_page_starts_and_stops_recordings_while_the_capture_runs(tmp_path: Path):
     sensed, kept = swaying(400), Kept()
     source = ReplaySource(sensed, HMD2Session, 1.5)
-    capture = LiveCapture(
-        small_hmd2(), [source], [kept], setup=source.setup, recorder=FilesSink, recordings=tmp_path / "all"
-    )
+    capture = LiveCapture(small_hmd2(), [source], [kept], recordings=tmp_path / "all", known=Known(setup=source.setup))
 
     def press() -> None:
         for frames, on in ((20, True), (120, False), (150, True)):

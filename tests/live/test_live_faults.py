@@ -16,9 +16,9 @@ from websockets.sync.client import connect
 
 from ports import free_port
 from wearcap.apps.live.capture import LiveCapture
-from wearcap.apps.live.devices import Devices
+from wearcap.apps.live.devices import Device
 from wearcap.apps.live.packets import MAX_POINTS_WAITING, Inbox, Packet
-from wearcap.apps.live.setup import plain_name, read_setup, write_setup
+from wearcap.apps.live.setup import Known, plain_name, read_setup, write_setup
 from wearcap.apps.live.sink import SinkThread
 from wearcap.apps.live.sinks import sink_of
 from wearcap.apps.live.sinks.files import FilesSink, join_sections
@@ -59,9 +59,9 @@ def test_names_that_look_alike_have_files_of_their_own():
 def test_a_wearer_without_a_name_and_one_called_wearer_are_both_in_the_report():
     sensed, kept = swaying(60), Kept()
     script = [packet for pair in zip(heads(sensed, ""), heads(sensed, "wearer")) for packet in pair]
-    report = LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup=ReplaySource(sensed, HMD2Session).setup).run(
-        30.0
-    )
+    report = LiveCapture(
+        small_hmd2(), [Scripted(script)], [kept], known=Known(setup=ReplaySource(sensed, HMD2Session).setup)
+    ).run(30.0)
     assert {name: row["sessions"] for name, row in report["wearers"].items()} == {"unnamed wearer": 1, "wearer": 1}
 
 
@@ -109,7 +109,7 @@ def test_a_name_from_the_network_is_no_path_and_a_named_wearer_keeps_their_set_u
     assert known is not None
     write_setup(known.with_height(1.61), tmp_path / f"setup_{plain_name('a/b')}.json")
     script = list(heads(sensed, "a/b"))
-    LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup_file=tmp_path / "setup.json").run(30.0)
+    LiveCapture(small_hmd2(), [Scripted(script)], [kept], known=Known(file=tmp_path / "setup.json")).run(30.0)
     assert kept.motion("a/b").skeleton.stature == pytest.approx(1.61, abs=1e-3)
     assert [path.name for path in tmp_path.iterdir()] == [f"setup_{plain_name('a/b')}.json"]
 
@@ -117,7 +117,9 @@ def test_a_name_from_the_network_is_no_path_and_a_named_wearer_keeps_their_set_u
 def test_a_height_that_is_given_is_that_of_a_known_set_up_too():
     sensed, kept = swaying(60), Kept()
     setup = ReplaySource(sensed, HMD2Session).setup
-    capture = LiveCapture(small_hmd2(), [Scripted(list(heads(sensed)))], [kept], setup=setup, height_m=1.85)
+    capture = LiveCapture(
+        small_hmd2(), [Scripted(list(heads(sensed)))], [kept], known=Known(setup=setup, height_m=1.85)
+    )
     capture.run(30.0)
     assert kept.motion().skeleton.stature == pytest.approx(1.85, abs=1e-3)
 
@@ -132,22 +134,26 @@ def standing(seconds: float = 4.0):
 def test_a_set_up_that_cannot_be_written_is_noted(tmp_path: Path):
     (tmp_path / "file").write_text("")
     capture = LiveCapture(
-        small_hmd2(), [Scripted(list(standing()))], [Kept()], height_m=1.7, setup_file=tmp_path / "file" / "setup.json"
+        small_hmd2(),
+        [Scripted(list(standing()))],
+        [Kept()],
+        known=Known(height_m=1.7, file=tmp_path / "file" / "setup.json"),
     )
     about = capture.run(30.0)["wearers"]["wearer"]
     assert about["frames"] > 0
     assert any("setup.json" in note for note in about["notes"])
-    capture = LiveCapture(small_hmd2(), [Scripted(list(standing()))], [], height_m=1.7, setup_file=tmp_path / "s.json")
+    capture = LiveCapture(
+        small_hmd2(), [Scripted(list(standing()))], [], known=Known(height_m=1.7, file=tmp_path / "s.json")
+    )
     capture.run(30.0)
     assert read_setup(tmp_path / "s.json").skeleton.stature == pytest.approx(1.7, abs=1e-3)
 
 
-def test_a_recorder_that_fails_is_in_the_report(tmp_path: Path):
+def test_a_recorder_that_fails_is_in_the_report(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("wearcap.apps.live.capture.FilesSink", lambda _: Broken())
     sensed = swaying(120)
     setup = ReplaySource(sensed, HMD2Session).setup
-    capture = LiveCapture(
-        small_hmd2(), [Scripted(list(heads(sensed)))], [], setup=setup, recorder=lambda _: Broken(), record=tmp_path
-    )
+    capture = LiveCapture(small_hmd2(), [Scripted(list(heads(sensed)))], [], record=tmp_path, known=Known(setup=setup))
     sinks = capture.run(30.0)["sinks"]
     assert sinks["broken"]["failed"] > 0
     assert sinks["broken"]["last_error"] == "the cable was pulled"
@@ -215,19 +221,19 @@ def test_what_sessions_refused_and_dropped_is_in_the_report_at_the_end(monkeypat
         script[k] = packet._replace(sample=packet.sample._replace(T_world_device=wrong)), 0.0
     again = [(packet._replace(sent_s=packet.sent_s + 9.0), 0.0) for packet, _ in script]
     setup = ReplaySource(sensed, HMD2Session).setup
-    about = LiveCapture(small_hmd2(), [Scripted(script + again)], [], setup=setup).run(60.0)["wearers"]["wearer"]
+    about = LiveCapture(small_hmd2(), [Scripted(script + again)], [], known=Known(setup=setup)).run(60.0)["wearers"][
+        "wearer"
+    ]
     assert about["sessions"] == 2
     assert about["refused"] == {"head: not finite": 4}
     assert about["dropped"] == 4
 
 
 def test_packets_behind_the_newest_are_late_also_one_after_another():
-    devices, pose = Devices(("head",)), swaying(2).head.T_world_device[0]
-    device = devices.admit("head")
-    assert device is not None
+    device, pose = Device(), swaying(2).head.T_world_device[0]
     for time_s in (1.0, 1.3, 1.1, 1.2, 1.4, 0.1, 0.2):  # at last the clock is set back
         device.see(Packet("", "head", "", time_s, time_s, HeadSample(time_s, pose)), "", time_s)
-    assert devices.late == 2
+    assert device.late == 2
 
 
 class Failing(Source):
@@ -250,7 +256,9 @@ def test_a_source_that_fails_is_started_again_and_ends_no_other(monkeypatch):
     monkeypatch.setattr("wearcap.apps.live.capture.RESTART_S", 0.01)
     sensed, kept, failing = swaying(60), Kept(), Failing(listens=True)
     setup = ReplaySource(sensed, HMD2Session).setup
-    report = LiveCapture(small_hmd2(), [failing, Scripted(list(heads(sensed)))], [kept], setup=setup).run(30.0)
+    report = LiveCapture(small_hmd2(), [failing, Scripted(list(heads(sensed)))], [kept], known=Known(setup=setup)).run(
+        30.0
+    )
     assert failing.runs == 3
     assert len(kept.motion()) == 60
     assert report["refused"] == {"failing:1: failed (ValueError), and is started again": 2}
@@ -262,7 +270,7 @@ def test_a_source_that_never_runs_ends_the_capture_with_its_reason():
 
 
 def test_silent_strangers_make_room(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("wearcap.apps.live.capture.FORGOTTEN_S", 0.0)
+    monkeypatch.setattr("wearcap.apps.live.recent.FORGOTTEN_S", 0.0)
     sensed, kept = swaying(60), Kept()
     strangers = [next(heads(sensed, f"stranger {k}")) for k in range(20)]
     lone = [(packet._replace(device=f"tracker {k}", wearer="anna"), 0.0) for k, (packet, _) in enumerate(strangers * 3)]
@@ -270,7 +278,7 @@ def test_silent_strangers_make_room(tmp_path: Path, monkeypatch):
     setup = ReplaySource(sensed, HMD2Session).setup
     assert setup is not None
     write_setup(setup, tmp_path / "setup_anna.json")
-    LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup_file=tmp_path / "setup.json").run(30.0)
+    LiveCapture(small_hmd2(), [Scripted(script)], [kept], known=Known(file=tmp_path / "setup.json")).run(30.0)
     assert len(kept.motion("anna")) == 60
 
 

@@ -2,26 +2,35 @@
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "pipelines"))
 
 from hps_walk import floor_points, hps_recording
 from hydra.utils import instantiate
+from test_hps_stream import pieces
 
 from wearcap.apps.live.capture import LiveCapture
+from wearcap.apps.live.setup import Known
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sources.replay import ReplaySource
+from wearcap.cli.capture import main as capture
 from wearcap.cli.conf import compose
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import Motion
+from wearcap.recording.pieces import close_pieces, write_piece
 from wearcap.recording.timing import joined
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.sensors.samples import LocalizationSample, SuitPiece
-from wearcap.systems.hps.stream import HpsSession
+from wearcap.systems.hmd2.stream import HMD2Session
+from wearcap.systems.hps.stream import HpsSession, HpsStream
 
 
 class Kept(Sink):
@@ -39,7 +48,7 @@ def test_a_suit_and_a_localised_camera_become_registered_poses():
     system = instantiate(compose("capture", ["pipeline=hps", "recording=none"]).pipeline, _convert_="all")
     source, kept = ReplaySource(recording, HpsSession, math.inf), Kept()
     place = CaptureInput(recording, scan=Scan(floor_points()))
-    report = LiveCapture(system, [source], [kept], source=place, setup=source.setup).run(120.0)
+    report = LiveCapture(system, [source], [kept], source=place, known=Known(setup=source.setup)).run(120.0)
     motion = joined(kept.pieces)
     assert motion is not None and recording.motion is not None  # noqa: PT018
     frame = torch.searchsorted(recording.motion.timestamps, motion.timestamps - 1e-6)
@@ -77,3 +86,28 @@ def test_frames_out_of_order_and_doubled_are_sorted_and_bad_ones_counted():
     assert set(session.refused[0]) <= {"localization: not finite", "suit: late"}
     assert session.refused[0]["localization: not finite"] == 1
     assert sum(len(part) for part in parts) == len(torch.cat([part.timestamps for part in parts]).unique())
+
+
+def test_a_growing_recording_becomes_the_motion_of_its_pieces(tmp_path):
+    growing, pipeline = tmp_path / "growing", "pipeline=paper/hps_without_scene"
+    parts = pieces(hps_recording(seconds=8.0))
+    parts[3] = replace(parts[3], localization=None, camera=None)
+    for number, part in enumerate(parts):
+        write_piece(replace(part, suit=None) if number == 5 else part, growing, number)
+    close_pieces(growing)
+    capture([pipeline, "live=true", f"recording={growing}", f"output={tmp_path}", f"hydra.run.dir={tmp_path}"])
+    system = instantiate(compose("capture", [pipeline, "recording=none"]).pipeline, _convert_="all")
+    stream, expected = HpsStream(system, parts[0], None), []
+    for number, part in enumerate(parts):
+        expected.append(None if number == 5 else stream.push(part.suit, part.localization))
+    whole = joined([part for part in (*expected, stream.finish()) if part is not None])
+    found = read_motion(tmp_path / "wearer" / "motion.npz")
+    assert whole is not None
+    torch.testing.assert_close(found.timestamps, whole.timestamps, rtol=0, atol=0)
+    torch.testing.assert_close(found.t_world_root, whole.t_world_root, rtol=0, atol=0)
+    torch.testing.assert_close(found.R_parent_joint, whole.R_parent_joint, rtol=0, atol=1e-6)
+
+
+def test_a_system_that_follows_no_growing_recording_says_so():
+    with pytest.raises(WearcapError, match="cannot follow a growing recording"):
+        HMD2Session.of_piece(None, hps_recording(seconds=1.0), Path(), None)

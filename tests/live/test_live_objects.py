@@ -21,7 +21,7 @@ from ports import free_port, listens
 from wearcap.apps.live import wearer as wearer_module
 from wearcap.apps.live.capture import LiveCapture
 from wearcap.apps.live.packets import HEAD, OBJECT, Packet
-from wearcap.apps.live.setup import Setup
+from wearcap.apps.live.setup import Known, Setup
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sinks.objects import objects_of
 from wearcap.apps.live.sinks.vmc import VmcSink
@@ -63,7 +63,7 @@ def placed(folder: Path, seconds: float = 1.2) -> CaptureInput:
 def test_a_replay_gives_the_offline_capture_with_its_objects(settings, tmp_path: Path):
     system, place, kept = drawn_echo(**settings), placed(tmp_path), Kept()
     source = ReplaySource(place.recording, EchoSession, math.inf, objects=EchoSession.of_objects(system, place))
-    report = LiveCapture(system, [source], [kept], source=place, setup=source.setup).run(120.0)
+    report = LiveCapture(system, [source], [kept], source=place, known=Known(setup=source.setup)).run(120.0)
     motion, whole = kept.motion(), system(place, 0)
     torch.testing.assert_close(motion.timestamps, whole.timestamps, atol=1e-6, rtol=0)
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
@@ -130,7 +130,7 @@ def sent_over_udp(place: CaptureInput, *sinks: Sink) -> tuple[Motion, dict]:
     port, kept = free_port(socket.SOCK_DGRAM), Kept()
     setup = ReplaySource(place.recording, EchoSession).setup
     source = source_of(f"json://127.0.0.1:{port}")
-    capture = LiveCapture(drawn_echo(anchor=False), [source], [kept, *sinks], source=place, setup=setup)
+    capture = LiveCapture(drawn_echo(anchor=False), [source], [kept, *sinks], source=place, known=Known(setup=setup))
     reports: list[dict] = []
     thread = threading.Thread(target=lambda: reports.append(capture.run(240.0)))
     thread.start()
@@ -304,5 +304,5 @@ def test_other_systems_count_objects_as_unknown():
     wearer, sessions = opened(takes_objects=False)
     wearer.take(choice("box_1", 5.0, 105.0))
     wearer.take(head(5.0, 105.0))
-    assert wearer.unknown == 1
+    assert wearer.status().counts.unknown == 1
     assert not sessions[0].chosen

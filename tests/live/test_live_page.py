@@ -11,10 +11,10 @@ import torch
 
 from carried_box import boxes
 from live_show import FPS, PIECE, Show, walking
+from wearcap.apps.live.pacing import BEHIND_S, Playout
 from wearcap.apps.live.page import MAX_WEARERS, LivePage
 from wearcap.apps.live.page_devices import Devices
 from wearcap.apps.live.page_panel import sinks_html, wearer_html
-from wearcap.apps.live.playout import BEHIND_S, Playout
 from wearcap.apps.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.apps.viewer.page import COLORS
 from wearcap.body.skeleton import skeleton_of_height
@@ -101,12 +101,12 @@ def test_bones_are_the_joints_of_the_frame_that_is_shown(page, show):
     person = page._persons["anna"]
     shown_s = person.playout.step(1.0)[1]
     truth = motion.T_world_joint[round(shown_s * FPS)]
-    handle = person.body.handle
+    handle = person.layers.body.handle
     placed = np.stack([bone.position for bone in handle.bones]) + handle.position
     np.testing.assert_allclose(placed, truth.t.numpy(), atol=1e-5)
     turned = torch.tensor(np.stack([bone.wxyz for bone in handle.bones]))
     torch.testing.assert_close(rotation.matrix_from_quat_wxyz(turned).float(), truth.R, atol=1e-5, rtol=0)
-    assert person.feet is not None
+    assert person.layers.feet is not None
 
 
 def test_objects_are_where_the_motion_has_them_and_stay_there(show):
@@ -188,22 +188,22 @@ def test_persons_have_their_own_colours_leave_and_come_back(page, show):
         page.take(name, motion.sliced(0, 10))
     page.draw(1.0)
     anna, ben = page._persons["anna"], page._persons["ben"]
-    assert tuple(anna.body.handle.color) == COLORS[0]
-    assert tuple(ben.body.handle.color) == COLORS[1]
-    assert ben.body.handle.position[0] - anna.body.handle.position[0] == pytest.approx(1.3, abs=1e-5)
+    assert tuple(anna.layers.body.handle.color) == COLORS[0]
+    assert tuple(ben.layers.body.handle.color) == COLORS[1]
+    assert ben.layers.body.handle.position[0] - anna.layers.body.handle.position[0] == pytest.approx(1.3, abs=1e-5)
     page.end("anna")
     page.draw(1.1)
-    assert not anna.body.handle.visible
-    assert ben.body.handle.visible
+    assert not anna.layers.body.handle.visible
+    assert ben.layers.body.handle.visible
     taller = replace(show.persons["anna"].sliced(0, 10), skeleton=skeleton_of_height(1.95))
     page.begin("anna", taller.skeleton, FPS)
     page.take("anna", taller)
     page.draw(1.2)
-    assert anna.body.handle.visible
-    assert anna.skeleton is taller.skeleton
+    assert anna.layers.body.handle.visible
+    assert anna.layers.body.motion.skeleton is taller.skeleton
     page._panel.wearers["ben"].shown.value = False
     page.draw(1.3)
-    assert not ben.body.handle.visible
+    assert not ben.layers.body.handle.visible
 
 
 def test_take_only_stores_and_keeps_a_bounded_number(page, show):

@@ -12,6 +12,7 @@ from test_live_capture import Kept, small_hmd2, swaying
 
 from wearcap.apps.live.capture import CATCH_UP_S, LiveCapture
 from wearcap.apps.live.packets import HEAD, Packet
+from wearcap.apps.live.setup import Known
 from wearcap.apps.live.sources.replay import ReplaySource
 from wearcap.apps.live.wearer import LEFT_OUT_S
 from wearcap.sensors.samples import HeadSample
@@ -29,7 +30,7 @@ class Turns:
         monkeypatch.setattr(time, "monotonic", lambda: self.now_s)
         self.kept, self.recording = Kept(), swaying(240)
         setup = ReplaySource(self.recording, HMD2Session).setup
-        self.capture = LiveCapture(small_hmd2(), sources, [self.kept], setup=setup)
+        self.capture = LiveCapture(small_hmd2(), sources, [self.kept], known=Known(setup=setup))
         self.capture.sinks[0].start()
 
     def deliver(self, first_s: float, stop_s: float, arrived_s: float | None = None) -> None:
@@ -76,7 +77,7 @@ def test_a_capture_whose_engine_was_slow_catches_up(monkeypatch):
     assert turns.capture.wearers[""].stage == "away"
     turns.go_on(22.0, 24.0)
     times, about = turns.end()
-    assert turns.kept.left == [""]
+    assert turns.kept.left == ["", ""], "at the stall and at the end"
     check_caught_up(times, about, 2.0, 22.0, left_out=20 * 60)
 
 

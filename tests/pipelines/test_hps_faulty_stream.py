@@ -8,7 +8,7 @@ import pytest
 import torch
 from hps_walk import hps_recording
 from hydra.utils import instantiate
-from test_hps_stream import pieces
+from test_hps_stream import followed, pieces
 
 from bad_packets import Mutator, broken, unchecked
 from wearcap.cli.conf import compose
@@ -18,7 +18,7 @@ from wearcap.recording.pieces import _piece_path, close_pieces, follow_pieces, w
 from wearcap.systems.hps import stream as hps_stream
 from wearcap.systems.hps.energy import Solution
 from wearcap.systems.hps.pipeline import HPS
-from wearcap.systems.hps.stream import HpsStream, StreamSettings, follow
+from wearcap.systems.hps.stream import HpsStream, StreamSettings
 
 SETTINGS = StreamSettings(start_s=1.0, window_s=3.0)
 SECONDS, FAULT = 8, 4
@@ -132,7 +132,7 @@ def test_bad_camera_poses_are_bridged_by_the_suit(hps, parts, undisturbed, name)
 def test_a_piece_is_missing_or_comes_twice(hps, parts, undisturbed):
     given = [*parts[:4], parts[2], *parts[5:]]
     refused = Counter()
-    found = list(follow(hps, given, None, settings=SETTINGS, refused=refused))
+    found = list(followed(hps, given, None, settings=SETTINGS, refused=refused))
     assert refused == {"suit: off the clock": 1}
     assert torch.equal(times_of(found), times_of(undisturbed))
     assert all(motion.t_world_root.isfinite().all() for motion in found)
@@ -142,7 +142,7 @@ def test_a_piece_is_missing_or_comes_twice(hps, parts, undisturbed):
 def test_where_the_clock_moves_a_new_stretch_begins(hps, parts, undisturbed, by_s):
     refused, odd = Counter(), shifted(parts[2], 500.0)
     given = [*parts[:3], odd, *parts[3:], *(shifted(part, SECONDS + by_s) for part in parts)]
-    found = list(follow(hps, given, None, settings=SETTINGS, refused=refused))
+    found = list(followed(hps, given, None, settings=SETTINGS, refused=refused))
     assert refused == {"suit: off the clock": 1}
     assert all((motion.timestamps.diff() > 0).all() for motion in found)
     first = times_of(undisturbed)
@@ -154,7 +154,7 @@ def test_where_the_clock_moves_a_new_stretch_begins(hps, parts, undisturbed, by_
 def test_where_every_piece_is_bad_it_is_reported(hps, parts):
     given = [broken(part, suit=broken(part.suit, t_world_root=part.suit.t_world_root * math.nan)) for part in parts]
     with pytest.raises(WearcapError, match="no piece can be used .suit: not finite."):
-        list(follow(hps, given, None, settings=SETTINGS))
+        list(followed(hps, given, None, settings=SETTINGS))
 
 
 def test_pieces_without_a_suit_or_a_readable_file_are_passed_over(hps, parts, tmp_path):
@@ -163,7 +163,7 @@ def test_pieces_without_a_suit_or_a_readable_file_are_passed_over(hps, parts, tm
     close_pieces(tmp_path)
     _piece_path(tmp_path, 5).write_bytes(b"nothing")
     refused = Counter()
-    found = list(follow(hps, follow_pieces(tmp_path, refused=refused), None, settings=SETTINGS, refused=refused))
+    found = list(followed(hps, follow_pieces(tmp_path, refused=refused), None, settings=SETTINGS, refused=refused))
     assert refused == {"piece: damaged file": 1, "suit: wrong type or shape": 1}
     assert times_of(found)[-1] > SECONDS - 0.1
     with pytest.raises(WearcapError):

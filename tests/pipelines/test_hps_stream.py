@@ -1,6 +1,9 @@
 """HPS on a growing recording: the frames of the whole, in order, from bounded memory."""
 
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,12 +12,12 @@ from hydra.utils import instantiate
 
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
-from wearcap.recording import Recording
+from wearcap.recording import Motion, Recording
 from wearcap.recording.pieces import _piece_path, close_pieces, follow_pieces, write_piece
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps.pipeline import HPS
-from wearcap.systems.hps.stream import HpsStream, StreamSettings, follow
+from wearcap.systems.hps.stream import HpsSession, HpsStream, StreamSettings
 
 SETTINGS = StreamSettings(start_s=2.0, window_s=6.0)
 
@@ -52,6 +55,26 @@ def pieces(recording: Recording, seconds: float = 1.0, lost: tuple[float, float]
     return parts
 
 
+def followed(
+    hps: HPS,
+    parts: Iterable[Recording],
+    scan: Scan | None,
+    settings: StreamSettings | None = None,
+    refused: Counter[str] | None = None,
+) -> Iterator[Motion]:
+    """Motion of a growing recording; `refused` counts what cannot be used."""
+    stream, refused = None, Counter() if refused is None else refused
+    for part in parts:
+        sample = HpsSession.of_piece(hps, part, Path(), refused if stream else None)
+        stream = stream or HpsStream(hps, part, scan, settings)
+        stream.refused = refused
+        if sample is not None:
+            stream.take(sample)
+            yield from filter(None, [stream.poses()])
+    while stream is not None and (last := stream.poses(ended=True)) is not None:
+        yield last
+
+
 def root_error_cm(motions: list, recording: Recording) -> torch.Tensor:
     times = torch.cat([motion.timestamps for motion in motions])
     assert recording.motion is not None
@@ -73,7 +96,7 @@ def streamed():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HpsStream, "push", watched)
-        online = list(follow(hps(), pieces(recording), Scan(floor_points()), settings=SETTINGS))
+        online = list(followed(hps(), pieces(recording), Scan(floor_points()), settings=SETTINGS))
     return recording, online, kept
 
 
@@ -88,7 +111,7 @@ def test_every_frame_comes_once_and_in_order_nearly_as_good_as_offline(streamed)
 
 def test_lost_localisation_is_bridged_by_the_suit():
     recording = hps_recording(seconds=24.0)
-    motions = list(follow(hps(), pieces(recording, lost=(8.0, 16.0)), Scan(floor_points()), settings=SETTINGS))
+    motions = list(followed(hps(), pieces(recording, lost=(8.0, 16.0)), Scan(floor_points()), settings=SETTINGS))
     error = root_error_cm(motions, recording)
     assert error[8 * 30 : 16 * 30].max() < 40.0  # the suit alone is 16 cm off by then, and turned by 2°
     assert error[-60:].mean() < 6.0
@@ -100,7 +123,7 @@ def test_a_path_that_has_drifted_is_left_within_three_seconds():
     share = ((recording.suit.timestamps - 8.0) / 4.0).clamp(0.0, 1.0).float()
     drift = share[:, None] * torch.tensor([0.5, -0.6, 0.0])
     drifting = replace(recording, suit=replace(recording.suit, t_world_root=recording.suit.t_world_root + drift))
-    motions = list(follow(hps(), pieces(drifting, lost=(8.0, 12.0)), Scan(floor_points()), settings=SETTINGS))
+    motions = list(followed(hps(), pieces(drifting, lost=(8.0, 12.0)), Scan(floor_points()), settings=SETTINGS))
     error = root_error_cm(motions, recording)
     assert error[int(11.0 * 30)] > 30.0
     assert error[15 * 30 :].max() < 10.0
@@ -140,10 +163,10 @@ def test_pieces_are_followed_until_the_end(tmp_path):
 def test_what_cannot_be_followed_is_refused_with_a_reason():
     clapping = hps_recording(seconds=2.0, camera_lead_s=0.3)
     with pytest.raises(WearcapError, match="clock=shared"):
-        list(follow(hps(), pieces(clapping), None))
+        list(followed(hps(), pieces(clapping), None))
     parts = pieces(hps_recording(seconds=4.0))
     with pytest.raises(WearcapError, match="no scan of the scene, which the energy's term contact_plane needs"):
-        list(follow(hps(), parts, None))
+        list(followed(hps(), parts, None))
     never = pieces(hps_recording(seconds=3.0), lost=(0.0, 9.0))
     with pytest.raises(WearcapError, match="never localised"):
-        list(follow(hps(), never, Scan(floor_points()), settings=SETTINGS))
+        list(followed(hps(), never, Scan(floor_points()), settings=SETTINGS))

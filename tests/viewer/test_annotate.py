@@ -129,8 +129,8 @@ def test_saves_that_must_not_be(dataset, tmp_path):
         assert ask(server, "POST", "/recordings/0/labels", good, Origin="http://elsewhere.net")[0] == 403
         assert ask(server, "POST", "/recordings/0/labels", good, Content_Type="text/plain")[0] == 403
         assert ask(server, "GET", "/recordings", Host="elsewhere.net:18300")[0] == 403
-        for length in ("99999999999", "9" * 5000, "-1", "1e3"):
-            assert ask(server, "POST", "/recordings/0/labels", "", Content_Length=length)[0] == 413
+        for length, status in (("99999999999", 413), ("9" * 5000, 411), ("-1", 411), ("1e3", 411)):
+            assert ask(server, "POST", "/recordings/0/labels", "", Content_Length=length)[0] == status
     assert not list(tmp_path.iterdir())
 
 

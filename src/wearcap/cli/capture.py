@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,9 @@ from rich.console import Console
 from rich.markup import escape
 from torch import Tensor
 
+from wearcap.apps.live.capture import LiveCapture
+from wearcap.apps.live.sink import Sink
+from wearcap.apps.live.sources.pieces import PiecesSource
 from wearcap.apps.viewer.page_layers import with_objects
 from wearcap.apps.viewer.picture import contact_sheet, save_png, write_video
 from wearcap.body.anny_body import anny_body
@@ -32,7 +34,7 @@ from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
-from wearcap.io.formats.scene_folder import cloud_file, read_scan
+from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.saving import on_skeleton, write_smplh
 from wearcap.reading import load, read
@@ -144,20 +146,29 @@ def _on_smpl(
     return on_skeleton(motion, body.skeleton), body, betas, template_pelvis(arrays, betas).tolist()
 
 
-def _live(system: System, config: DictConfig, folder: Path) -> None:
-    """Follow a growing recording: motion-000000.npz, … appear as frames become final."""
-    source = Path(config.recording)
-    if not source.is_dir():
-        raise WearcapError("no such folder", where=source, expected="a growing recording: piece-000000.safetensors, …")
-    scan = None
-    if config.scene is not None:
-        scan = read_scan(cloud_file(config.scene), metres_per_unit=config.metres_per_unit)
-    refused: Counter[str] = Counter()
-    for number, motion in enumerate(system.follow(source, scan, refused)):
-        write_motion(motion, folder / f"motion-{number:06d}.npz")
+class _Shown(Sink):
+    """Shows up to when a growing recording is captured."""
+
+    name = "progress"
+
+    def take(self, wearer: str, motion: Motion) -> None:
         show(f"{motion.timestamps[-1].item():9.2f} s", flush=True)
-    for reason, count in refused.items():
+
+
+def _live(system: System, config: DictConfig, folder: Path) -> None:
+    """Follow a growing recording: the motion's files grow with it."""
+    growing = Path(config.recording)
+    if not growing.is_dir():
+        raise WearcapError("no such folder", where=growing, expected="a growing recording: piece-000000.safetensors, …")
+    pieces = PiecesSource(growing, system)
+    scan = None if config.scene is None else cloud_file(config.scene)
+    place = CaptureInput(pieces.first, growing, scan, config.metres_per_unit)
+    report = LiveCapture(system, [pieces], [_Shown()], source=place, record=folder).run()
+    (about,) = report["wearers"].values()
+    for reason, count in (report["refused"] | about["refused"]).items():
         show(f"refused {count} × {reason}")
+    if not about["frames"]:
+        raise WearcapError(f"no motion: {' '.join(about['notes'])}", growing)
     show(f"motion: {folder}")
 
 

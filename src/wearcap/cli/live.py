@@ -20,13 +20,11 @@ from rich.markup import escape
 
 from wearcap.apps.live.capture import LiveCapture, report_text
 from wearcap.apps.live.page import LivePage
-from wearcap.apps.live.setup import Setup, read_setup
+from wearcap.apps.live.setup import Known, read_setup
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sinks import sink_of
-from wearcap.apps.live.sinks.files import FilesSink
 from wearcap.apps.live.source import Source
-from wearcap.apps.live.sources import source_of
-from wearcap.apps.live.sources.replay import ReplaySource
+from wearcap.apps.live.sources import sources_of
 from wearcap.apps.web.guard import LOOPBACK
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose, hydra_main, load_pipeline
@@ -35,7 +33,7 @@ from wearcap.errors import WearcapError, nearest, require_choice
 from wearcap.files import write_text
 from wearcap.reading import read
 from wearcap.recording.store import MANIFEST, dataset_folder
-from wearcap.runtime.system import CaptureInput, System
+from wearcap.runtime.system import CaptureInput
 from wearcap.tracking.stature import with_stature
 
 MAX_MESSAGES = 20
@@ -66,23 +64,22 @@ def run(config: DictConfig) -> dict[str, Any]:
             _show(f"height: {stature}" if stature.known else f"{stature}: give height=… (m)")
         place = CaptureInput.in_dataset(recording, folder, config.scene, config.metres_per_unit)
     require_choice(config.hands, HANDS, f"hands={config.hands}")
-    sources, setup = _sources(config, system, place)
-    speed = float(config.speed)
-    sinks: list[Sink] = [sink_of(each, config.host, pace=speed <= 1) for each in _listed(config.to)]
+    speed, given = float(config.speed), _listed(config.source)
+    sources, of_replay = sources_of(given, config.host, system, place, speed)
     setup_file = None if config.setup is None else Path(config.setup)
+    setup = read_setup(setup_file) if setup_file is not None and setup_file.is_file() else None
+    if (config.height is None or speed > 1) and not config.guided:
+        setup = setup or of_replay
+    # A recording has the wrists themselves.
+    hands = "joint" if "replay" in given else "grip" if config.hands == "auto" else config.hands
+    sinks: list[Sink] = [sink_of(each, config.host, pace=speed <= 1) for each in _listed(config.to)]
     capture = LiveCapture(
         system,
         sources,
         sinks,
+        known=Known(setup, config.height, hands, config.guided, setup_file),
         source=place,
-        setup=setup,
-        height_m=config.height,
-        # a recording has the wrists themselves
-        hands="joint" if "replay" in _listed(config.source) else "grip" if config.hands == "auto" else config.hands,
-        guided=config.guided,
-        setup_file=setup_file,
         seed=config.seed,
-        recorder=FilesSink,
         record=None if config.record is None else Path(config.record),
         recordings=Path(config.paths.run),
     )
@@ -153,29 +150,6 @@ def _stopped_by_signals(capture: LiveCapture) -> Iterator[None]:
     finally:
         for number, handler in zip(numbers, before):
             signal.signal(number, handler)
-
-
-def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> tuple[list[Source], Setup | None]:
-    """The sources, and the set-up as far as it is known. Raises WearcapError for a replay without a recording."""
-    setup = read_setup(config.setup) if config.setup is not None and Path(config.setup).is_file() else None
-    sources: list[Source] = []
-    for text in _listed(config.source):
-        if text != "replay":
-            sources.append(source_of(text, config.host))
-            continue
-        if place is None:
-            raise WearcapError(
-                "source=replay without a recording", expected="recording=DATASET/NAME, or any file with one"
-            )
-        kind = system.session_class()
-        objects = kind.of_objects(system, place)
-        replay = ReplaySource(place.recording, kind, float(config.speed), objects=objects)
-        sources.append(replay)
-        if (config.height is None or float(config.speed) > 1) and not config.guided:
-            setup = setup or replay.setup
-    if not sources:
-        raise WearcapError("no source", expected="source=replay, or source=vmc://:39540 …")
-    return sources, setup
 
 
 def _tell(config: DictConfig, sources: list[Source], sinks: list[Sink], page: LivePage | None) -> None:

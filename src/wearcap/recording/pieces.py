@@ -4,6 +4,7 @@
 file `end` marks the end. The first piece describes the wearer and the camera.
 """
 
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -32,13 +33,17 @@ def close_pieces(folder: str | Path) -> None:
 
 
 def follow_pieces(
-    folder: str | Path, patience_s: float = 60.0, poll_s: float = 0.1, refused: Counter[str] | None = None
+    folder: str | Path,
+    patience_s: float = 60.0,
+    poll_s: float = 0.1,
+    refused: Counter[str] | None = None,
+    stop: threading.Event | None = None,
 ) -> Iterator[Recording]:
-    """Yield pieces as they appear, until `end`. A damaged file is counted in `refused` and skipped.
+    """Yield pieces as they appear, until `end` or `stop`. A damaged file is counted in `refused` and skipped.
 
     Raises WearcapError when no piece appears for `patience_s`, and without `refused` for a damaged file.
     """
-    folder, number, since = Path(folder), 0, time.monotonic()
+    folder, number, since, stop = Path(folder), 0, time.monotonic(), stop or threading.Event()
     while True:
         ended = (folder / END).exists()  # checked first, so that pieces written before the end are not missed
         if _piece_path(folder, number).exists():
@@ -57,5 +62,5 @@ def follow_pieces(
             what = f"no piece {number} after {patience_s:.0f} s"
             expected = f"{_piece_path(folder, number).name}, or a file named {END!r}"
             raise WearcapError(what, folder, expected, "Is the recorder still running?")
-        else:
-            time.sleep(poll_s)
+        elif stop.wait(poll_s):
+            return

@@ -1,7 +1,9 @@
 """Streaming captures: samples go in as devices send them, final poses come out."""
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 from jaxtyping import Float
@@ -9,11 +11,11 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.recording import Motion
+from wearcap.recording import Motion, Recording
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors.packets import Admitted, HeadInput, WristInput
-from wearcap.sensors.samples import ActiveObject, ObjectSample
+from wearcap.sensors.samples import ActiveObject, ObjectSample, SuitPiece
 from wearcap.tracking.head_path import Chunk, HeadTrack
 
 
@@ -55,6 +57,12 @@ class Session:
         Raises WearcapError as that capture does.
         """
         return []
+
+    @classmethod
+    def of_piece(cls, system: Any, piece: Recording, folder: Path, refused: Counter[str] | None) -> SuitPiece | None:
+        """The sample of a piece of a recording that grows in a folder; None for one that cannot be used, which is counted
+        in `refused`. Raises WearcapError for a system that follows none, and without `refused` for such a piece."""
+        raise WearcapError("this pipeline cannot follow a growing recording", expected="pipeline=hps")
 
     @property
     def fps(self) -> float:

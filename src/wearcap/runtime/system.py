@@ -7,8 +7,7 @@ its graphs (`exports`, `from_export`). A further system is a further folder unde
 import importlib
 import importlib.util
 from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -183,10 +182,6 @@ class System(ABC):
         Raises WearcapError for a system that does not stream.
         """
         raise WearcapError(f"pipeline {self.name!r} is none that captures streams", fix="Choose another pipeline=….")
-
-    def follow(self, folder: Path, scan: Scan | None, refused: Counter[str]) -> Iterator[Motion]:
-        """Final pieces of motion of a recording that still grows in a folder; `refused` counts unusable pieces."""
-        raise WearcapError("this pipeline cannot follow a growing recording", expected="pipeline=hps")
 
     def exports(self) -> Exports:
         """The networks as graphs for ONNX and torch.export. Raises WearcapError for a system without any."""

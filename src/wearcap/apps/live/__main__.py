@@ -9,10 +9,9 @@ import sys
 from pathlib import Path
 
 from wearcap.apps.live.capture import LiveCapture, report_text
+from wearcap.apps.live.setup import Known
 from wearcap.apps.live.sinks import sink_of
-from wearcap.apps.live.sinks.files import FilesSink
-from wearcap.apps.live.sources import source_of
-from wearcap.apps.live.sources.replay import ReplaySource
+from wearcap.apps.live.sources import sources_of
 from wearcap.boundary.own import trusting
 from wearcap.errors import WearcapError
 from wearcap.export.files import load_exported
@@ -40,25 +39,15 @@ def main(arguments: list[str]) -> None:
         system = load_exported(options.model)
     if not isinstance(system, System):
         raise WearcapError("a model that captures no motion", options.model, "one of hmd2, mocap_every or echo")
-    sources, setup, place = [source_of(text) for text in options.source], None, None
+    texts, place = [*options.source], None
     if options.recording is not None:
         place = CaptureInput.in_dataset(read(options.recording), dataset_folder(options.recording))
-        kind = system.session_class()
-        replay = ReplaySource(place.recording, kind, options.speed, objects=kind.of_objects(system, place))
-        sources.append(replay)
-        setup = replay.setup if options.height is None else None
+        texts.append("replay")
+    sources, setup = sources_of(texts, "127.0.0.1", system, place, options.speed)
+    hands = "grip" if place is None else "joint"  # a recording has the wrists themselves
+    known = Known(setup if options.height is None else None, options.height, hands)
     sinks = [sink_of(text, "127.0.0.1", options.speed <= 1) for text in options.to]
-    capture = LiveCapture(
-        system,
-        sources,
-        sinks,
-        source=place,
-        setup=setup,
-        height_m=options.height,
-        hands="grip" if place is None else "joint",  # a recording has the wrists themselves
-        recorder=FilesSink,
-        record=options.record,
-    )
+    capture = LiveCapture(system, sources, sinks, known=known, source=place, record=options.record)
     print(report_text(capture.run(options.seconds)), end="")
 
 

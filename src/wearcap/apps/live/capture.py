@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,15 @@ from typing import Any
 import torch
 
 from wearcap.apps.live.packets import HEAD, Inbox, Packet
-from wearcap.apps.live.setup import Setup, plain_name, read_setup, write_setup
+from wearcap.apps.live.recent import Recent
+from wearcap.apps.live.setup import Known, Setup, write_setup
 from wearcap.apps.live.setup_estimation import SetupEstimation
 from wearcap.apps.live.sink import Sink, SinkThread
+from wearcap.apps.live.sinks.files import FilesSink
 from wearcap.apps.live.source import Source
-from wearcap.apps.live.status import LiveStatus, SinkStatus
+from wearcap.apps.live.status import Ask, LiveStatus
 from wearcap.apps.live.wearer import LiveWearer, Opener
+from wearcap.apps.web.sockets import LoopThread
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -31,8 +35,6 @@ from wearcap.sensors.samples import HeadSample, WatchSample, WristSample
 
 MAX_WEARERS = 8
 """Most wearers; packets of further ones are counted as refused."""
-FORGOTTEN_S = 60.0
-"""Time without packets after which a wearer who is not captured makes room for another."""
 WAIT_S = 0.02
 """Longest time without a look at who has left and what the page wishes."""
 CATCH_UP_S = 5.0
@@ -82,23 +84,18 @@ class LiveCapture:
         sources: Sequence[Source],
         sinks: Sequence[Sink],
         *,
+        known: Known | None = None,
         source: CaptureInput | None = None,
-        setup: Setup | None = None,
-        height_m: float | None = None,
-        hands: str = "grip",
-        guided: bool = False,
-        setup_file: Path | None = None,
         seed: int = 0,
-        recorder: Callable[[Path], Sink] | None = None,
         record: Path | None = None,
         recordings: Path = Path(),
     ):
-        """`source`: recording, scan and objects of the place, for systems that use them; `setup`: of every wearer, from the
-        beginning; `hands`: what hand poses are (`setup.hand_seat`); `setup_file`: where what the first minute finds is kept; `recorder` makes the sink that writes to a
-        folder, from the start where `record` names one, else in `recordings` when the
-        page asks for it. Raises WearcapError for a system that does not stream.
+        """`source`: recording, scan and objects of the place, for systems that use them; `record`: folder in which to
+        record from the start; `recordings`: that in which to record when the page asks for it.
+
+        Raises WearcapError for a system that does not stream.
         """
-        self.system, self.sources = system, list(sources)
+        self.system, self.sources, self.known = system, list(sources), known or Known()
         self.latency_s = system.latency_s
         kind = system.session_class()
         if kind.takes_objects and source is None:
@@ -106,27 +103,22 @@ class LiveCapture:
         environment = system.objects(source) if kind.takes_objects and source is not None else None
         self.objects = () if environment is None else environment.objects
         """Those of the place, where the system takes objects."""
-        minute = lambda before, guide: SetupEstimation(  # noqa: E731
+        self.opener = Opener(
+            lambda wearer: kind.of_wearers(system, [wearer], seed, source),
             kind.devices,
-            tracked=kind.tracks_wrists,
-            hands=hands,
-            height_m=height_m,
-            setup=before,
-            guided=guide or guided,
+            kind.tracks_wrists,
+            kind.takes_objects,
+            self._estimation,
+            any(source.patient for source in self.sources),
         )
-        open_session = lambda wearer: kind.of_wearers(system, [wearer], seed, source)  # noqa: E731
-        self.opener = Opener(open_session, kind.devices, kind.tracks_wrists, kind.takes_objects, minute)
         self.inbox = Inbox()
-        self.wearers: dict[str, LiveWearer] = {}
+        self.wearers = Recent(MAX_WEARERS, self._new_wearer, self._is_captured)
         self.sinks = [SinkThread(sink) for sink in sinks]
-        self._setup, self._setup_file, self._guided, self._height_m = setup, setup_file, guided, height_m
-        self._recorder, self._recording = recorder, None
-        self._record_from_start = record
-        self._recorded: SinkThread | None = None
+        self._begun: set[str] = set()
+        """Wearers whose motion the sinks take."""
+        self._record, self._recordings, self._recording = record, recordings, None
         self._recorders: list[SinkThread] = []
-        """All recorders of this capture, those that are closed among them: the report has them."""
-        self._closing: list[threading.Thread] = []
-        self._recordings = recordings
+        """All recorders of this capture; while `_recording` names a folder the last of them records in it."""
         self._wishes: list[Callable[[], None]] = []
         self._stopping = threading.Event()
         self._began_s = time.monotonic()
@@ -134,7 +126,17 @@ class LiveCapture:
         """Our time (s) of the last look at what has come."""
         self._capacity = _Capacity()
         self._failure: WearcapError | None = None
-        self._sources_done = threading.Event()
+
+    def _estimation(self, before: Setup | None, guided: bool) -> SetupEstimation:
+        known, opener = self.known, self.opener
+        return SetupEstimation(
+            opener.devices,
+            tracked=opener.tracks_wrists,
+            hands=known.hands,
+            height_m=known.height_m,
+            setup=before,
+            guided=guided or known.guided,
+        )
 
     # --- running ----------------------------------------------------------------------------------------------------
 
@@ -148,17 +150,19 @@ class LiveCapture:
             for sink in self.sinks:
                 sink.start()
                 opened.append(sink)
-            if self._record_from_start is not None:
-                self._start_recording(self._record_from_start)
-            loop = asyncio.new_event_loop()
-            thread = threading.Thread(target=self._run_sources, args=(loop,), name="sources", daemon=True)
+            if self._record is not None:
+                self._start_recording(self._record)
+            thread = LoopThread("sources")
+            running = thread.start(self._run_sources())
+            running.add_done_callback(lambda _: self.inbox.wake())
             self._began_s = time.monotonic()
-            thread.start()
             with suppress(KeyboardInterrupt):  # the user's way to end a capture: what has come is kept, and reported
-                self._loop(seconds)
-            with suppress(RuntimeError):  # the sources have ended by themselves
-                loop.call_soon_threadsafe(lambda: [task.cancel() for task in asyncio.all_tasks(loop)])
-            thread.join(5.0)
+                while not self._stopping.is_set() and time.monotonic() - self._began_s < seconds:
+                    done = running.done()
+                    self._step()
+                    if done and not self.inbox.waiting:
+                        break
+            thread.stop()
         finally:
             for wearer in self.wearers.values():
                 self._send(wearer, wearer.leave())
@@ -166,8 +170,8 @@ class LiveCapture:
             self._fulfil()
             for sink in opened:
                 sink.close()
-            for closing in self._closing:
-                closing.join()
+            for recorder in self._recorders:
+                recorder.close(JOIN_S)
             gc.unfreeze()
         if self._failure is not None:
             raise self._failure
@@ -192,13 +196,6 @@ class LiveCapture:
         """Add a sink before the capture runs: one that needs the capture itself, as the page does."""
         self.sinks.append(SinkThread(sink))
 
-    def _loop(self, seconds: float) -> None:
-        while not self._stopping.is_set() and time.monotonic() - self._began_s < seconds:
-            done = self._sources_done.is_set()
-            self._step()
-            if done and not self.inbox.waiting:
-                return
-
     def _step(self) -> None:
         """One turn: wishes, packets, poses."""
         self._fulfil()
@@ -206,22 +203,18 @@ class LiveCapture:
         self._catch_up()
         self._share(packets)
         for packet in packets:
-            wearer = self.wearers.get(packet.wearer) or self._welcome(packet.wearer)
+            wearer = self.wearers.admit(packet.wearer, time.monotonic())
             if wearer is None:
                 self.inbox.refuse("capture", f"more than {MAX_WEARERS} wearers")
-                continue
-            if wearer.session is None and self._live >= self._capacity.most:
+            elif wearer.session is None and self._live >= self._capacity.most:
                 self.inbox.refuse("capture", "a wearer more than this machine captures")
-                continue
-            before = wearer.stage
-            wearer.take(packet)
-            if before != "live" and wearer.stage == "live":
-                self._begin(wearer)
+            else:
+                wearer.take(packet)
+                if wearer.session is not None and wearer.name not in self._begun:
+                    self._begin(wearer)
         now_s = time.monotonic()
         for wearer in self.wearers.values():
-            live = wearer.stage == "live"
             self._send(wearer, wearer.poses(now_s))
-            self._say_left(wearer, live)
 
     @property
     def _lossless(self) -> bool:
@@ -237,55 +230,25 @@ class LiveCapture:
             last = [wearer for wearer in self.wearers.values() if wearer.session is not None][-1]
             last.note("This machine is too slow for so many wearers: who came first is captured.")
             self._send(last, last.leave())
-            self._each_sink(lambda sink: sink.end(last.name))
 
     def _catch_up(self) -> None:
         """Begin all sessions anew where the last look is `CATCH_UP_S` ago; not of a replay, which must lose nothing."""
         now_s, before_s = time.monotonic(), self._looked_s
         self._looked_s = now_s
-        if now_s - before_s < CATCH_UP_S or self._lossless:
-            return
-        for wearer in self.wearers.values():
-            live = wearer.stage == "live"
-            self._send(wearer, wearer.catch_up(now_s))
-            self._say_left(wearer, live)
+        if now_s - before_s >= CATCH_UP_S and not self._lossless:
+            for wearer in self.wearers.values():
+                self._send(wearer, wearer.catch_up(now_s))
 
-    def _say_left(self, wearer: LiveWearer, was_live: bool) -> None:
-        """Tell the sinks that a wearer has left, if so."""
-        if was_live and wearer.stage == "away":
-            self._each_sink(lambda sink: sink.end(wearer.name))
+    def _is_captured(self, name: str) -> bool:
+        return name in self.wearers and self.wearers[name].session is not None
 
-    def _welcome(self, name: str) -> LiveWearer | None:
-        """A new wearer, in the place of one who has been silent where there are too many; None where there is none."""
-        if len(self.wearers) >= MAX_WEARERS:
-            silent = max(self.wearers.values(), key=lambda one: one.silent_s)
-            if silent.session is not None or silent.silent_s < FORGOTTEN_S:
-                return None
-            del self.wearers[silent.name]
-        setup, path = self._setup, self._setup_path(name)
-        wearer = self.wearers[name] = LiveWearer(name, self.opener, setup)
-        if name and path is not None and path.is_file():
-            with self._noted(wearer):
-                wearer.setup = read_setup(path)
-        if self._height_m is not None and wearer.setup is not None:
-            wearer.setup = wearer.setup.with_height(self._height_m)
-        if self._guided:
+    def _new_wearer(self, name: str) -> LiveWearer:
+        wearer = LiveWearer(name, self.opener)
+        with self._noted(wearer):
+            wearer.setup = self.known.of(name)
+        if self.known.guided:
             wearer.guide()
         return wearer
-
-    def _setup_path(self, wearer: str) -> Path | None:
-        """Where a wearer's set-up is kept."""
-        path = self._setup_file
-        return path.with_stem(f"{path.stem}_{plain_name(wearer)}") if path is not None and wearer else path
-
-    def _begin(self, wearer: LiveWearer) -> None:
-        assert wearer.skeleton is not None
-        for sink in self._all_sinks():
-            sink.begin(wearer.name, wearer.skeleton, wearer.fps)
-        path = self._setup_path(wearer.name)
-        if path is not None and wearer.setup is not None and wearer.first is not None:
-            with self._noted(wearer):
-                write_setup(wearer.setup, path)
 
     @contextmanager
     def _noted(self, *wearers: LiveWearer) -> Iterator[None]:
@@ -296,20 +259,32 @@ class LiveCapture:
             for wearer in wearers:
                 wearer.note(str(error))
 
+    def _begin(self, wearer: LiveWearer) -> None:
+        """A wearer's motion begins; what the first minute found is kept."""
+        assert wearer.skeleton is not None
+        self._begun.add(wearer.name)
+        for sink in self._all_sinks():
+            sink.begin(wearer.name, wearer.skeleton, wearer.fps)
+        path = self.known.file_of(wearer.name)
+        if path is not None and wearer.setup is not None and wearer.first is not None:
+            with self._noted(wearer):
+                write_setup(wearer.setup, path)
+
     def _send(self, wearer: LiveWearer, motions: list[Motion]) -> None:
-        for motion in motions:
-            self._each_sink(lambda sink, motion=motion: sink.take(wearer.name, motion))
+        """Give the sinks a wearer's poses, and say so if these were the last."""
+        left = wearer.session is None and wearer.name in self._begun
+        for sink in self._all_sinks():
+            for motion in motions:
+                sink.take(wearer.name, motion)
+            if left:
+                sink.end(wearer.name)
+        if left:
+            self._begun.remove(wearer.name)
 
     def _all_sinks(self) -> list[SinkThread]:
-        return [*self.sinks, *([] if self._recorded is None else [self._recorded])]
+        return [*self.sinks, *(self._recorders[-1:] if self._recording is not None else ())]
 
-    def _each_sink(self, call: Callable[[SinkThread], None]) -> None:
-        for sink in self._all_sinks():
-            call(sink)
-
-    def _run_sources(self, loop: asyncio.AbstractEventLoop) -> None:
-        asyncio.set_event_loop(loop)
-
+    async def _run_sources(self) -> None:
         async def keep(source: Source) -> None:
             while True:
                 try:
@@ -322,64 +297,37 @@ class LiveCapture:
                     self.inbox.refuse(source.name, f"failed ({type(error).__name__}), and is started again")
                 await asyncio.sleep(RESTART_S)
 
-        async def every() -> None:
-            await asyncio.gather(*(keep(source) for source in self.sources))
-
-        try:
-            loop.run_until_complete(every())
-        except asyncio.CancelledError:
-            pass
-        finally:
-            self._sources_done.set()
-            self.inbox.wake()
-            loop.close()
+        await asyncio.gather(*(keep(source) for source in self.sources))
 
     # --- what a page may ask (`status.LiveControls`) ----------------------------------------------------------------
 
     def status(self) -> LiveStatus:
-        sinks = tuple(
-            SinkStatus(each.sink.name, each.sink.sent, each.dropped, each.failed, each.last_error)
-            for each in self._all_sinks()
-        )
         wearers = tuple(wearer.status() for wearer in list(self.wearers.values()))
         recording = None if self._recording is None else str(self._recording)
+        sinks = tuple(sink.status() for sink in self._all_sinks())
         return LiveStatus(wearers, sinks, recording, time.monotonic() - self._began_s)
 
     def record(self, on: bool) -> None:
         """Start or stop recording."""
         self._wish(lambda: self._start_recording(None) if on else self._stop_recording())
 
-    def guide(self, wearer: str) -> None:
-        """Begin the guided first minute of a wearer, anew where there was one."""
-        self._wish(lambda: self._guide(wearer))
+    def ask(self, action: Ask, wearer: str) -> None:
+        """Do something about a wearer's first minute."""
 
-    def skip(self, wearer: str) -> None:
-        """Go on to the next step of the first minute, with defaults for this one."""
-        self._first(wearer, "skip")
+        def fulfil() -> None:
+            known = self.wearers.get(wearer)
+            if known is not None and action == "guide":
+                self._send(known, known.leave())
+                known.guide()
+            elif known is not None and known.first is not None:
+                getattr(known.first, action)()
 
-    def redo(self, wearer: str) -> None:
-        """Begin the step of the first minute again."""
-        self._first(wearer, "redo")
+        self._wish(fulfil)
 
     def stop(self) -> None:
         """End the capture."""
         self._stopping.set()
         self.inbox.wake()
-
-    def _first(self, wearer: str, action: str) -> None:
-        def fulfil() -> None:
-            first = self.wearers[wearer].first if wearer in self.wearers else None
-            if first is not None:
-                getattr(first, action)()
-
-        self._wish(fulfil)
-
-    def _guide(self, name: str) -> None:
-        wearer = self.wearers.get(name)
-        if wearer is not None:
-            self._send(wearer, wearer.leave())
-            self._each_sink(lambda sink: sink.end(name))
-            wearer.guide()
 
     def _wish(self, wish: Callable[[], None]) -> None:
         self._wishes.append(wish)
@@ -390,62 +338,37 @@ class LiveCapture:
             with self._noted(*self.wearers.values()):
                 self._wishes.pop(0)()
 
-    # --- recording --------------------------------------------------------------------------------------------------
-
     def _start_recording(self, folder: Path | None) -> None:
-        if self._recorder is None or self._recorded is not None:
+        if self._recording is not None:
             return
         folder = folder or self._recordings / f"recording_{datetime.now():%Y-%m-%d_%H-%M-%S}"
-        sink = SinkThread(self._recorder(folder), capacity=100_000)
+        sink = SinkThread(FilesSink(folder), capacity=100_000)
         sink.start()
         self._recorders.append(sink)
-        self._recorded, self._recording = sink, folder
+        self._recording = folder
         for wearer in self.wearers.values():
-            if wearer.stage == "live" and wearer.skeleton is not None:
+            if wearer.name in self._begun and wearer.skeleton is not None:
                 sink.begin(wearer.name, wearer.skeleton, wearer.fps)
 
     def _stop_recording(self) -> None:
-        """Close the files in a thread of its own: joining a long recording takes seconds."""
-        if self._recorded is not None:
-            closing = threading.Thread(target=self._recorded.close, args=(JOIN_S,), name="closing a recording")
-            closing.start()
-            self._closing.append(closing)
-        self._recorded = self._recording = None
-
-    # --- report -----------------------------------------------------------------------------------------------------
+        """The recorder joins its files by itself, which takes seconds of a long recording."""
+        if self._recording is not None:
+            self._recorders[-1].finish()
+        self._recording = None
 
     def report(self) -> dict[str, Any]:
         """Latencies, rates and counts as plain data."""
-        status = self.status()
+        status, system_ms = self.status(), 1000 * self.latency_s
         wearers, unnamed = {}, "wearer" if "wearer" not in self.wearers else "unnamed wearer"
         for each in status.wearers:
-            live = self.wearers[each.name]
-            wearers[each.name or unnamed] = {
-                "frames": each.frames,
-                "sessions": live.sessions,
-                "latency_ms": {
-                    "median": each.latency.median_ms,
-                    "p95": each.latency.p95_ms,
-                    "p99": each.latency.p99_ms,
-                    "of_the_system": 1000 * self.latency_s,
-                },
-                "dropped": each.dropped,
-                "late": each.late,
-                "gaps": each.gaps,
-                "unknown": live.unknown,
-                "clock_restarts": live.clocks.restarts,
-                "refused": live.refused,
-                "notes": list(each.notes),
+            about = asdict(each.counts) | {"notes": list(each.notes)}
+            wearers[each.name or unnamed] = about | {
+                "latency_ms": each.latency._asdict() | {"of_the_system": system_ms}
             }
-        sinks = {
-            each.sink.name: {
-                "sent": each.sink.sent,
-                "dropped": each.dropped,
-                "failed": each.failed,
-                "last_error": each.last_error,
-            }
-            for each in (*self.sinks, *self._recorders)
-        }
+        sinks = {}
+        for each in (*self.sinks, *self._recorders):
+            about = asdict(each.status())
+            sinks[about.pop("name")] = about
         return {
             "seconds": round(status.seconds, 3),
             "wearers": wearers,

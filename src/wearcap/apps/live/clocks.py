@@ -7,6 +7,8 @@ how the two clocks stand, and how they drift, however much single packets are de
 import statistics
 from collections import deque
 
+from wearcap.apps.live.recent import Recent
+
 BUCKET_S = 2.0
 """Time over which the quickest packet is kept."""
 BUCKETS = 60
@@ -18,6 +20,8 @@ DRIFT_AFTER_S = 20.0
 RESTART_S = 1.0
 """Deviation from the estimate that means another clock, if `AGREEING` packets in a row have it."""
 AGREEING = 5
+MAX_CLOCKS = 32
+"""Most clocks, and shifts, of one wearer; a sender that invents names gets no more."""
 LATE_FOR_S, HELD_BACK_S = 5.0, 10.0
 """Time for which all packets must be late for that; and lateness (s) that means it at once."""
 
@@ -28,8 +32,6 @@ class DeviceClock:
     def __init__(self) -> None:
         self.restarts = 0
         """How often the device's clock was set anew."""
-        self.arrived_s = 0.0
-        """Our time (s) of its newest packet."""
         self._far = 0
         """Packets in a row that are off by more than `RESTART_S`."""
         self._far_since_s = 0.0
@@ -43,14 +45,13 @@ class DeviceClock:
         """Smallest delay at device time `_at_s`."""
         self._at_s = 0.0
 
-    def see(self, sent_s: float, arrived_s: float) -> None:
-        """A packet with the device's time arrived."""
-        self.arrived_s = arrived_s
+    def see(self, sent_s: float, arrived_s: float) -> bool:
+        """A packet with the device's time arrived; whether it shows that the clock was set anew."""
         delay_s = arrived_s - sent_s
         if not self._quickest:
             self._quickest.append((sent_s, delay_s))
             self._delay_s, self._at_s = delay_s, sent_s
-            return
+            return False
         expected_s = self._delay_at(sent_s)
         # Early packets are impossible with one clock. Late ones mean another one, too, if they are later than an application
         # would hold them back, or all of some seconds are late: of those that are sent at once the newest is not.
@@ -59,12 +60,13 @@ class DeviceClock:
         if self._far == 1:
             self._far_since_s = arrived_s
         if self._far:
-            if self._far >= AGREEING and (not 0 < off_s < HELD_BACK_S or arrived_s - self._far_since_s >= LATE_FOR_S):
+            anew = not 0 < off_s < HELD_BACK_S or arrived_s - self._far_since_s >= LATE_FOR_S
+            if anew := self._far >= AGREEING and anew:
                 self.restarts += 1
                 self._far = 0
                 self._begin()
                 self.see(sent_s, arrived_s)
-            return
+            return anew
         if sent_s >= self._quickest[-1][0] + BUCKET_S:
             self._quickest.append((sent_s, delay_s))
             self._estimate()
@@ -72,6 +74,7 @@ class DeviceClock:
             self._quickest[-1] = (self._quickest[-1][0], delay_s)
         if delay_s < self._delay_at(sent_s):
             self._delay_s, self._at_s = delay_s, sent_s
+        return False
 
     def _delay_at(self, sent_s: float) -> float:
         return self._delay_s + self._drift * (sent_s - self._at_s)
@@ -102,7 +105,7 @@ class Clocks:
     def __init__(self) -> None:
         self.leader: str | None = None
         """Name of the clock that motion counts on; None: the first one seen decides."""
-        self._clocks: dict[str, DeviceClock] = {}
+        self._clocks = Recent(MAX_CLOCKS, lambda _: DeviceClock(), lambda name: name == self.leader)
         self._shifts: dict[str, tuple[str, float]] = {}
         """By device, the clock that it counted on, and seconds."""
 
@@ -114,25 +117,13 @@ class Clocks:
 
         A shift is void once the device's clock or the leading one is set anew: its delays are then others.
         """
-        if clock not in self._clocks:
-            if clock != self.leader and len(self._clocks) >= MAX_CLOCKS:
-                oldest = min((name for name in self._clocks if name != self.leader), key=self._seen_s)
-                if arrived_s - self._seen_s(oldest) < FORGOTTEN_S:
-                    return []
-                del self._clocks[oldest]
-            self._clocks[clock] = DeviceClock()
-        restarts = self._clocks[clock].restarts
-        self._clocks[clock].see(sent_s, arrived_s)
-        if self._clocks[clock].restarts == restarts:
+        known = self._clocks.admit(clock, arrived_s)
+        if known is None or not known.see(sent_s, arrived_s):
             return []
         void = [device for device, (own, _) in self._shifts.items() if clock in (own, self.leader)]
         for device in void:
             del self._shifts[device]
         return void
-
-    def _seen_s(self, clock: str) -> float:
-        """Our time (s) of a clock's newest packet."""
-        return self._clocks[clock].arrived_s
 
     def shift(self, device: str, clock: str, seconds: float) -> None:
         """Add to the times of a device that counts on a clock, beyond what delays show and what was added before.
@@ -166,9 +157,3 @@ class Clocks:
     def restarts(self) -> int:
         """How often clocks were set anew."""
         return sum(clock.restarts for clock in self._clocks.values())
-
-
-MAX_CLOCKS = 32
-"""Most clocks, and shifts, of one wearer; a sender that invents names gets no more."""
-FORGOTTEN_S = 60.0
-"""Time without packets after which a clock makes room for another."""

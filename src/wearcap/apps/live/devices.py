@@ -1,8 +1,6 @@
-"""The devices of one wearer: whose packets are admitted, their rates, and their poses as the page shows them."""
+"""One device of a wearer: its rate, how late its packets are, and its pose as the page shows it."""
 
 import math
-import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,8 +14,6 @@ from wearcap.sensors.samples import HeadSample, LocalizationSample, ObjectSample
 
 MAX_DEVICES = 32
 """Most devices of a wearer, beside those that the session needs."""
-FORGOTTEN_S = 60.0
-"""Time without packets after which a device makes room for another."""
 LATE_S = 1.0
 """Time by which a packet may be behind the newest one and be late; beyond it the device's clock was set back."""
 RATE_S = 2.0
@@ -62,42 +58,6 @@ class Device:
             pose = Rigid(rotation.about_axis("z", torch.tensor(seat.yaw_rad)) @ pose.R, pose.t)
         joint = None if seat is None else seat.joint
         return DeviceStatus(name, 0.0 if silent_s > RATE_S else hz, pose, silent_s, joint)
-
-
-class Devices:
-    """A wearer's devices by name, bounded: names come from the network."""
-
-    def __init__(self, needed: Sequence[str]):
-        """`needed`: those that are always admitted."""
-        self.needed = tuple(needed)
-        self._devices: dict[str, Device] = {}
-
-    def admit(self, name: str) -> Device | None:
-        """The device of a name, new where it was not known; None where there are too many."""
-        if (known := self._devices.get(name)) is not None:
-            return known
-        if name not in self.needed and len(self._devices) >= MAX_DEVICES:
-            others = (each for each in self._devices if each not in self.needed)
-            oldest = min(others, key=lambda each: self._devices[each].arrived_s)
-            if time.monotonic() - self._devices[oldest].arrived_s < FORGOTTEN_S:
-                return None
-            del self._devices[oldest]
-        device = self._devices[name] = Device()
-        return device
-
-    def get(self, name: str) -> Device | None:
-        """The device of a name, if it is known."""
-        return self._devices.get(name)
-
-    @property
-    def late(self) -> int:
-        """Packets of all of them that came after newer ones."""
-        return sum(device.late for device in list(self._devices.values()))
-
-    def status(self, seats: Mapping[str, Seat]) -> tuple[DeviceStatus, ...]:
-        """All of them, for the page; any thread may ask. `seats`: by device, as far as they are known."""
-        now_s = time.monotonic()
-        return tuple(device.status(name, seats.get(name), now_s) for name, device in list(self._devices.items()))
 
 
 def _shown(sample: Sample) -> Rigid | None:

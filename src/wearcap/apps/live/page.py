@@ -5,7 +5,6 @@ It is a sink like any other: `take` only stores, a thread of the page's own draw
 
 import math
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -14,10 +13,10 @@ import torch
 import viser
 from torch import Tensor
 
+from wearcap.apps.live.pacing import Playout
 from wearcap.apps.live.packets import HEAD
 from wearcap.apps.live.page_devices import Devices
 from wearcap.apps.live.page_panel import Panel
-from wearcap.apps.live.playout import Playout
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.status import MAX_POINTS, LiveControls, LiveStatus, WearerStatus
 from wearcap.apps.viewer.page import COLORS, UPDATES_PER_S
@@ -25,6 +24,7 @@ from wearcap.apps.viewer.page_layers import (
     BodyLayer,
     FeetLayer,
     LabelLayer,
+    MotionLayers,
     ObjectsLayer,
     add_points,
     surface_or_sticks,
@@ -61,11 +61,7 @@ class _Person:
     playout: Playout = field(default_factory=Playout)
     wanted: Skeleton | None = None
     """Of the motion that comes; None once the wearer has left."""
-    skeleton: Skeleton | None = None
-    """Of the body that is drawn."""
-    body: BodyLayer | None = None
-    feet: FeetLayer | None = None
-    label: LabelLayer | None = None
+    layers: MotionLayers | None = None
     objects: dict[str, ObjectsLayer] = field(default_factory=dict)
     """By name, those that had a pose; without a new one they stay where they were."""
     shown: bool = True
@@ -79,68 +75,43 @@ class _Person:
 
     @property
     def visible(self) -> bool:
-        return self.body is not None and bool(self.body.handle.visible)
+        return self.layers is not None and self.layers.visible
 
     def draw(self, server: viser.ViserServer, name: str, now_s: float, several: bool) -> None:
         """Show the body, and the objects that it moves, at its play-out's time."""
-        if self.wanted is None:
-            self._hide()
+        found = None if self.wanted is None else self.playout.step(now_s)
+        if found is not None:
+            self._follow(server, name, found[0])
+        elif self.wanted is not None:
             return
-        found = self.playout.step(now_s)
-        if found is None:
-            return
-        motion, shown_s = found
-        if self.body is None or self.skeleton is not motion.skeleton:
-            self._build(server, name, motion)
-        assert self.body is not None
-        for layer in (self.body, self.feet, self.label):
-            if layer is not None:
-                layer.motion = motion
-        if self.feet is not None and motion.contact_prob is not None:
-            self.feet.contact, self.feet.clock = motion.contact_prob > 0.5, motion.timestamps
-        self._take_objects(server, motion)
-        mine = [(layer, self.shown) for layer in (self.body, self.feet, *self.objects.values())]
-        for layer, visible in (*mine, (self.label, self.shown and several)):
-            if layer is None:
-                continue
-            for handle in layer.handles:
-                if handle.visible != visible:
-                    handle.visible = visible
-            if visible:
-                layer.show(shown_s)
+        visible = self.shown and found is not None
+        if self.layers is not None:
+            self.layers.place(np.zeros(3), visible, named=visible and several)
+        for layer in self.objects.values():
+            layer.place(np.zeros(3), visible)
+        if visible and found is not None and self.layers is not None:
+            for layer in (self.layers, *self.objects.values()):
+                layer.show(found[1])
 
-    def _build(self, server: viser.ViserServer, name: str, motion: Motion) -> None:
-        """Nodes for a skeleton; those of an earlier one are replaced. Pieces of one motion have one skeleton."""
+    def _follow(self, server: viser.ViserServer, name: str, motion: Motion) -> None:
+        """Nodes for a skeleton, in place of those of another one, and for objects that the motion moves for the first time."""
         node = f"world/person_{self.number}"
-        if self.body is None or self.skeleton != motion.skeleton:
-            self.remove_body()
-            self.body = BodyLayer(server, node, motion, surface_or_sticks(motion.skeleton, {}), self.color)
-            self.feet = FeetLayer.of(server, f"{node}_feet", motion, None)
-            self.label = LabelLayer(server, node, motion)
-            self.label.handle.text = fitting(name) or "wearer"
-            self.label.handle.font_size_mode, self.label.handle.font_scene_height = "scene", LABEL_M
-        self.skeleton = motion.skeleton
-
-    def _take_objects(self, server: viser.ViserServer, motion: Motion) -> None:
-        """Nodes of objects that a motion moves for the first time, and their newest poses."""
-        for name, track in (motion.object_motion or {}).items():
-            if name not in self.objects and name in self.known:
-                node = f"world/person_{self.number}_objects"
-                self.objects[name] = ObjectsLayer(server, node, [self.known[name]], {})
-            if name in self.objects and len(track):
-                self.objects[name].tracks[name] = track
-
-    def _hide(self) -> None:
-        for layer in (self.body, self.feet, self.label, *self.objects.values()):
-            for handle in () if layer is None else layer.handles:
-                if handle.visible:
-                    handle.visible = False
-
-    def remove_body(self) -> None:
-        for layer in (self.body, self.feet, self.label):
-            for handle in () if layer is None else layer.handles:
-                handle.remove()
-        self.body = self.feet = self.label = self.skeleton = None
+        before = None if self.layers is None else self.layers.body.motion.skeleton
+        if before is not motion.skeleton and before != motion.skeleton:
+            if self.layers is not None:
+                self.layers.remove()
+            body = BodyLayer(server, node, motion, surface_or_sticks(motion.skeleton, {}), self.color)
+            label = LabelLayer(server, node, motion)
+            label.handle.text = fitting(name) or "wearer"
+            label.handle.font_size_mode, label.handle.font_scene_height = "scene", LABEL_M
+            self.layers = MotionLayers(body, FeetLayer.of(server, f"{node}_feet", motion, None), label)
+        if self.layers is not None:
+            self.layers.follow(motion)
+        for item_name, track in (motion.object_motion or {}).items():
+            if item_name not in self.objects and item_name in self.known:
+                self.objects[item_name] = ObjectsLayer(server, f"{node}_objects", [self.known[item_name]], {})
+            if item_name in self.objects and len(track):
+                self.objects[item_name].tracks[item_name] = track
 
 
 class LivePage(ServedPage, Sink):
@@ -224,17 +195,14 @@ class LivePage(ServedPage, Sink):
 
     # --- drawing ---------------------------------------------------------------------------------------------------
 
-    def run(self, seconds: float = math.inf) -> None:
-        """Draw until stopped, or for the given seconds; what cannot be drawn is counted."""
-        begin = time.monotonic()
-        while not self._stopped and (now := time.monotonic()) - begin < seconds:
-            try:
-                self.draw(now)
-            except Exception as error:  # a frame that cannot be drawn must not end the page
-                self.errors += 1
-                self.last_error = f"{type(error).__name__}: {error}"[:200]
-            step_s = 1 / UPDATES_PER_S if self.server.get_clients() else UNSEEN_S
-            time.sleep(max(0.002, step_s - (time.monotonic() - now)))
+    def update(self, now_s: float) -> None:
+        """Draw; what cannot be drawn is counted."""
+        try:
+            self.draw(now_s)
+        except Exception as error:  # a frame that cannot be drawn must not end the page
+            self.errors += 1
+            self.last_error = f"{type(error).__name__}: {error}"[:200]
+        self.step_s = 1 / UPDATES_PER_S if self.server.get_clients() else UNSEEN_S
 
     def draw(self, now_s: float) -> None:
         """Send one frame."""
@@ -254,10 +222,10 @@ class LivePage(ServedPage, Sink):
                 if fresh:
                     person.devices.see(self.server, of[name].devices if name in of else (), now_s)
                 # The body is late by the capture's latency and by its play-out.
-                latency_ms = of[name].latency.median_ms if name in of and person.visible else 0.0
+                latency_ms = of[name].latency.median if name in of and person.visible else 0.0
                 delay_s = latency_ms / 1000 + person.playout.behind_s
                 visible = person.shown and bool(self._panel.devices.value)
-                person.devices.show(now_s, delay_s, visible, person.body)
+                person.devices.show(now_s, delay_s, visible, None if person.layers is None else person.layers.body)
             self._follow(persons, now_s)
             if now_s - self._panel_s >= PANEL_S:
                 self._panel_s = now_s
@@ -275,7 +243,7 @@ class LivePage(ServedPage, Sink):
         shown = LiveStatus(tuple(known), self._status.sinks, self._status.recording, self._status.seconds)
         self._panel.update(shown, lambda name: self._persons[name].color, behind)
         floors = [wearer.floor_m for wearer in known if wearer.floor_m is not None and self._persons[wearer.name].shown]
-        if floors and math.isfinite(floors[0]) and self._floor.position[2] != floors[0]:
+        if floors and math.isfinite(floors[0]):
             self._floor.position = (0.0, 0.0, floors[0])
 
     def _show_points(self) -> None:
@@ -289,10 +257,7 @@ class LivePage(ServedPage, Sink):
         self._points = points
         every = torch.cat([each[-MAX_POINTS:].cpu() for each in points])[-MAX_POINTS:] if points else torch.zeros(0, 3)
         every = every[every.isfinite().all(-1)]
-        if len(every):
-            add_points(self.server, PointCloud(every))
-        else:
-            self.server.scene.remove_by_name("/surroundings/points")
+        add_points(self.server, PointCloud(every))
 
     def _has_points(self, wearer: WearerStatus) -> bool:
         person = self._persons.get(wearer.name)
@@ -300,7 +265,7 @@ class LivePage(ServedPage, Sink):
 
     def _follow(self, persons: dict[str, _Person], now_s: float) -> None:
         """Keep the middle of the persons that are shown, or of their heads, where the camera looks; the first one at once."""
-        bodies = [one.body.handle for one in persons.values() if one.body is not None and one.visible]
+        bodies = [one.layers.body.handle for one in persons.values() if one.layers is not None and one.visible]
         heads = [one.devices.known[HEAD].frame for one in persons.values() if HEAD in one.devices.known and one.shown]
         roots = [np.asarray(handle.position) for handle in bodies or heads]
         if not roots or (self._focus is not None and not self._panel.follow.value):

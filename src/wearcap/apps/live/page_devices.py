@@ -4,13 +4,15 @@ import math
 from collections import deque
 
 import numpy as np
+import torch
 import viser
-from jaxtyping import Float
 
 from wearcap.apps.live.status import DeviceStatus
 from wearcap.apps.viewer.page_layers import BodyLayer
 from wearcap.apps.web.page_text import fitting
+from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
+from wearcap.geometry.trajectory import interpolate_clamped, slerp
 
 MAX_SHOWN = 16
 """Most devices of one wearer that are shown."""
@@ -33,47 +35,38 @@ class Device:
         self.label = server.scene.add_label(
             f"{node}/name", _plain(self.joint), anchor="bottom-left", font_size_mode="scene", font_scene_height=LABEL_M
         )
-        self._path: deque[tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "4"]]] = deque(maxlen=KEPT)
+        self._path: deque[tuple[float, Rigid]] = deque(maxlen=KEPT)
 
     def see(self, device: DeviceStatus, now_s: float) -> None:
         """Keep where it is now; one without a pose is not shown."""
-        if device.joint is not None and device.joint != self.joint:
-            self.joint, self.label.text = device.joint, _plain(device.joint)
+        self.joint = device.joint or self.joint
+        self.label.text = _plain(self.joint)
         pose = device.T_world_device
         if pose is None or not bool(pose.R.isfinite().all()):
             self._path.clear()
-            return
-        wxyz = quat_wxyz_from_matrix(pose.R.double()).numpy()
-        self._path.append((now_s, pose.t.double().numpy().reshape(3), wxyz))
+        else:
+            self._path.append((now_s, Rigid(pose.R.double(), pose.t.double().reshape(3))))
 
     def show(self, at_s: float, visible: bool, body: BodyLayer | None) -> None:
         """Show where it was at a time (s) of the screen; a watch, which has no place, is at its wrist of the `body`."""
-        found = self._at(at_s) if visible else None
-        place = None if found is None else found[0]
+        found = self._at(at_s) if visible and self._path else None
+        place = None if found is None else found.t.numpy()
         if place is not None and not np.isfinite(place).all():
             skeleton = None if body is None else body.motion.skeleton
             place = None
             if body is not None and body.handle.visible and skeleton is not None and self.joint in skeleton:
                 bone = body.handle.bones[skeleton.index(self.joint)]
                 place = np.asarray(body.handle.position) + np.asarray(bone.position)
-        if self.frame.visible != (place is not None):
-            self.frame.visible = place is not None
+        self.frame.visible = place is not None
         if found is not None and place is not None:
-            self.frame.position, self.frame.wxyz = place, found[1]
+            self.frame.position, self.frame.wxyz = place, quat_wxyz_from_matrix(found.R).numpy()
 
-    def _at(self, at_s: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Place and rotation at a time, between the two that were seen around it; the ends beyond them."""
-        after = next((number for number, seen in enumerate(self._path) if seen[0] >= at_s), len(self._path))
-        if not self._path:
-            return None
-        if after in (0, len(self._path)):
-            return self._path[min(after, len(self._path) - 1)][1:]
-        (before_s, before, turned), (after_s, later, turned_later) = self._path[after - 1], self._path[after]
-        share = (at_s - before_s) / max(after_s - before_s, 1e-6)
-        if turned @ turned_later < 0:
-            turned_later = -turned_later
-        wxyz = (1 - share) * turned + share * turned_later
-        return (1 - share) * before + share * later, wxyz / max(float(np.linalg.norm(wxyz)), 1e-6)
+    def _at(self, at_s: float) -> Rigid:
+        """Pose at a time, between the two that were seen around it; the ends beyond them."""
+        times = torch.tensor([seen_s for seen_s, _ in self._path], dtype=torch.float64)
+        R, t = (torch.stack([getattr(pose, part) for _, pose in self._path]) for part in ("R", "t"))
+        at = torch.tensor([at_s], dtype=torch.float64)
+        return Rigid(slerp(times, R, at)[0], interpolate_clamped(times, t, at)[0])
 
 
 class Devices:

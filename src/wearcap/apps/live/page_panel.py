@@ -42,14 +42,14 @@ def wearer_html(wearer: WearerStatus, behind_s: float) -> str:
         rows.append(row(escaped(device.title, MAX_NAME), f"{number(device.hz)} Hz", ago, color=_BAD if silent else ""))
     if len(wearer.devices) > MAX_ROWS:
         rows.append(row(f"and {len(wearer.devices) - MAX_ROWS} more"))
-    latency = wearer.latency
+    counted = wearer.counts
     delays = [
         row("<b>Latency</b>", "<b>median</b>", "<b>p95</b>", "<b>p99</b>"),
-        row("ms", number(latency.median_ms), number(latency.p95_ms), number(latency.p99_ms)),
+        row("ms", *map(number, wearer.latency)),
     ]
     counts = [
-        row("Poses", number(wearer.frames), "Dropped", number(wearer.dropped)),
-        row("Late", number(wearer.late), "Gaps", number(wearer.gaps)),
+        row("Poses", number(counted.frames), "Dropped", number(counted.dropped)),
+        row("Late", number(counted.late), "Gaps", number(counted.gaps)),
         row(
             "Floor (m)",
             "–" if wearer.floor_m is None else f"{wearer.floor_m:.2f}",
@@ -93,29 +93,20 @@ class WearerFolder:
             self.redo = gui.add_button("Redo", visible=False, hint="Begin this step again")
             self.guide = gui.add_button("Guide me", hint="Height, floor and seats of the devices, step by step")
             self.numbers = gui.add_html("")
-        self.guide.on_click(lambda _: controls.guide(name))
-        self.skip.on_click(lambda _: controls.skip(name))
-        self.redo.on_click(lambda _: controls.redo(name))
-        self._texts: dict[int, str] = {}
+        self.guide.on_click(lambda _: controls.ask("guide", name))
+        self.skip.on_click(lambda _: controls.ask("skip", name))
+        self.redo.on_click(lambda _: controls.ask("redo", name))
 
     def update(self, wearer: WearerStatus, behind_s: float) -> None:
-        """Show a state; what has not changed is not sent."""
+        """Show a state; viser sends what has changed."""
         guided = wearer.step is not None
+        for handle in (self.step, self.progress, self.skip, self.redo):
+            handle.visible = guided
+        self.guide.visible = not guided
         if guided:
-            self._set(self.step, block(f'<b style="font-size:17px">{escaped(wearer.step or "")}</b>'))
-            if abs(self.progress.value - 100 * wearer.progress) > 0.5:
-                self.progress.value = min(max(100 * wearer.progress, 0.0), 100.0)
-        for handle, visible in (
-            *((handle, guided) for handle in (self.step, self.progress, self.skip, self.redo)),
-            (self.guide, not guided),
-        ):
-            if handle.visible != visible:
-                handle.visible = visible
-        self._set(self.numbers, wearer_html(wearer, behind_s))
-
-    def _set(self, handle: viser.GuiHtmlHandle, content: str) -> None:
-        if handle.content != content:
-            handle.content = content
+            self.step.content = block(f'<b style="font-size:17px">{escaped(wearer.step or "")}</b>')
+            self.progress.value = min(max(round(100 * wearer.progress), 0), 100)
+        self.numbers.content = wearer_html(wearer, behind_s)
 
 
 class Panel:
@@ -152,19 +143,11 @@ class Panel:
     ) -> None:
         """Show a state; wearers beyond those that the page has room for are left out by the caller."""
         self._recording = status.recording is not None
-        label = "Stop recording" if self._recording else "Record"
-        if self.record.label != label:
-            self.record.label = label
+        self.record.label = "Stop recording" if self._recording else "Record"
         minutes, seconds = divmod(int(status.seconds), 60)
         to = f"Recording to {Path(status.recording).name}" if status.recording is not None else "Not recording"
-        title = block(f"<b>{minutes}:{seconds:02d}</b> &nbsp; {escaped(to)}")
-        if self.title.content != title:
-            self.title.content = title
+        self.title.content = block(f"<b>{minutes}:{seconds:02d}</b> &nbsp; {escaped(to)}")
         for wearer in status.wearers:
             self.folder(wearer.name, color_of(wearer.name)).update(wearer, behind.get(wearer.name, 0.0))
-        if status.sinks:
-            content = sinks_html(status.sinks)
-            if self._sinks.content != content:
-                self._sinks.content = content
-            if not self._sinks_folder.visible:
-                self._sinks_folder.visible = True
+        self._sinks_folder.visible = bool(status.sinks)
+        self._sinks.content = sinks_html(status.sinks)

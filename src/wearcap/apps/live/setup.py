@@ -12,25 +12,27 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
+import msgspec
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.skeleton import WRISTS, Site, Skeleton, skeleton_of_height
+from wearcap.body.skeleton import Skeleton, skeleton_of_height
 from wearcap.boundary.opening import placed, understood
-from wearcap.boundary.texts import read_json_object
-from wearcap.errors import WearcapError
+from wearcap.boundary.texts import read_json_object, require_layout
 from wearcap.files import write_text
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE
 from wearcap.io.devices.headset_axes import palm_of, wrist_of_hand
+from wearcap.runtime.graphs import SkeletonEntry, skeleton_to_json
 
 MAX_SEATS, MAX_JOINTS, MAX_NOTES = 64, 256, 100
 """Most seats, joints and notes of a file."""
-_VERSION = 1
 _EXPECTED = "the file that wearcap live wrote with setup=FILE"
+_Part = Annotated[float, msgspec.Meta(ge=-1.01, le=1.01)]
+_Metre = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +68,31 @@ class Setup:
         return replace(self, skeleton=skeleton_of_height(height_m, self.skeleton), notes=(*self.notes, note))
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of wearers before they come."""
+
+    setup: Setup | None = None
+    """Of everyone; None: the first minute finds it."""
+    height_m: float | None = None
+    hands: str = "grip"
+    """What hand poses are (`hand_seat`)."""
+    guided: bool = False
+    """Whether everyone begins with the guided first minute."""
+    file: Path | None = None
+    """Where what the first minute finds is kept; that of a named wearer, under the name beside it."""
+
+    def file_of(self, wearer: str) -> Path | None:
+        file = self.file
+        return file if file is None or not wearer else file.with_stem(f"{file.stem}_{plain_name(wearer)}")
+
+    def of(self, wearer: str) -> Setup | None:
+        """A wearer's set-up as far as it is known. Raises WearcapError as `read_setup` does."""
+        file = self.file_of(wearer)
+        setup = read_setup(file) if wearer and file is not None and file.is_file() else self.setup
+        return setup if setup is None or self.height_m is None else setup.with_height(self.height_m)
+
+
 def plain_name(wearer: str) -> str:
     """A wearer's name as part of a file's or folder's name: names from the network are no paths.
 
@@ -88,88 +115,51 @@ def hand_seat(joint: str, kind: str) -> Seat:
     return Seat(joint, R_joint_hand, palm_of(joint, kind))
 
 
+class _Seat(msgspec.Struct):
+    """A seat in a file; the rotation is a unit quaternion."""
+
+    joint: Literal["head", "left_wrist", "right_wrist"]
+    R_joint_device_wxyz: Annotated[tuple[_Part, ...], msgspec.Meta(min_length=4, max_length=4)]
+    t_joint_device: tuple[_Metre, _Metre, _Metre]
+    yaw_rad: Annotated[float, msgspec.Meta(ge=-2 * math.pi, le=2 * math.pi)]
+
+    def seat(self) -> Seat:
+        """Raises ValueError for a quaternion that is none."""
+        wxyz = torch.tensor(self.R_joint_device_wxyz, dtype=torch.float64)
+        if not abs(wxyz.norm().item() - 1) <= 0.01:
+            raise ValueError("R_joint_device_wxyz is no unit quaternion")
+        return Seat(self.joint, matrix_from_quat_wxyz(wxyz).float(), torch.tensor(self.t_joint_device), self.yaw_rad)
+
+
+class _File(msgspec.Struct):
+    """Layout of a file."""
+
+    wearcap_setup: Literal[1]
+    skeleton: SkeletonEntry
+    floor_m: Annotated[float, msgspec.Meta(ge=-1e4, le=1e4)] | None
+    seats: Annotated[dict[str, _Seat], msgspec.Meta(max_length=MAX_SEATS)]
+    notes: Annotated[list[str], msgspec.Meta(max_length=MAX_NOTES)]
+
+
 def write_setup(setup: Setup, path: str | Path) -> None:
     """Write a setup, atomically."""
-    skeleton = setup.skeleton
-    content = {
-        "wearcap_setup": _VERSION,
-        "skeleton": {
-            "name": skeleton.name,
-            "joint_names": list(skeleton.joint_names),
-            "parents": list(skeleton.parents),
-            "t_parent_joint": skeleton.t_parent_joint.tolist(),
-            "sites": {name: [site.joint, *site.t_joint_site] for name, site in skeleton.sites.items()},
-        },
-        "floor_m": setup.floor_m,
-        "seats": {device: _row(seat) for device, seat in setup.seats.items()},
-        "notes": list(setup.notes),
-    }
-    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    seats = {}
+    for device, seat in setup.seats.items():
+        wxyz = quat_wxyz_from_matrix(seat.R_joint_device.double()).tolist()
+        seats[device] = _Seat(seat.joint, tuple(wxyz), tuple(seat.t_joint_device.tolist()), seat.yaw_rad)
+    content = msgspec.to_builtins(
+        {"wearcap_setup": 1, "skeleton": skeleton_to_json(setup.skeleton), "floor_m": setup.floor_m, "seats": seats}
+    )
+    write_text(path, json.dumps(content | {"notes": list(setup.notes)}, indent=1, allow_nan=False) + "\n")
 
 
 def read_setup(path: str | Path) -> Setup:
     """What `write_setup` wrote. Raises WearcapError for a file that is no setup."""
-    content = read_json_object(path)
-    fix = "Do the first minute again, or delete the file."
-    if content.get("wearcap_setup") != _VERSION:
-        raise WearcapError("no setup of a wearer", path, _EXPECTED, fix)
+    content, fix = read_json_object(path), "Do the first minute again, or delete the file."
     with placed(path), understood("not a setup of a wearer", path, _EXPECTED, fix):
-        floor_m = None if content["floor_m"] is None else _number(content["floor_m"], "floor_m", 1e4)
-        seats, notes = content["seats"], content["notes"]
-        if not isinstance(seats, dict) or len(seats) > MAX_SEATS:
-            raise ValueError("seats by device are missing, or too many")
-        if not (isinstance(notes, list) and len(notes) <= MAX_NOTES and all(isinstance(one, str) for one in notes)):
-            raise ValueError("notes that are no sentences")
-        skeleton = _skeleton(content["skeleton"])
-        return Setup(skeleton, {name: _seat(row) for name, row in seats.items()}, floor_m, tuple(notes))
-
-
-def _row(seat: Seat) -> dict[str, Any]:
-    return {
-        "joint": seat.joint,
-        "R_joint_device_wxyz": quat_wxyz_from_matrix(seat.R_joint_device.double()).tolist(),
-        "t_joint_device": seat.t_joint_device.tolist(),
-        "yaw_rad": seat.yaw_rad,
-    }
-
-
-def _seat(row: dict[str, Any]) -> Seat:
-    if row["joint"] not in ("head", *WRISTS):
-        raise ValueError(f"a seat on {str(row['joint'])[:30]!r}")
-    wxyz = torch.tensor(_numbers(row["R_joint_device_wxyz"], 4, "R_joint_device_wxyz", 1.01), dtype=torch.float64)
-    if abs(wxyz.norm().item() - 1) > 0.01:
-        raise ValueError("R_joint_device_wxyz is no unit quaternion")
-    t = torch.tensor(_numbers(row["t_joint_device"], 3, "t_joint_device", 1.0))
-    R = matrix_from_quat_wxyz(wxyz).float()
-    return Seat(row["joint"], R, t, _number(row["yaw_rad"], "yaw_rad", 2 * math.pi))
-
-
-def _skeleton(row: dict[str, Any]) -> Skeleton:
-    names, parents, offsets, sites = (row[key] for key in ("joint_names", "parents", "t_parent_joint", "sites"))
-    if not (isinstance(names, list) and 0 < len(names) <= MAX_JOINTS and len(sites) <= MAX_JOINTS):
-        raise ValueError("a skeleton without joints, or with too many")
-    if not all(isinstance(name, str) for name in (row["name"], *names)):
-        raise ValueError("joints without names")
-    if not (isinstance(parents, list) and all(type(parent) is int for parent in parents)):
-        raise ValueError("parents that are no joints' numbers")
-    t_parent_joint = torch.tensor([_numbers(offset, 3, "t_parent_joint", 10.0) for offset in offsets])
-    places = {name: (row[0], _numbers(row[1:], 3, f"site {name[:30]}", 10.0)) for name, row in sites.items()}
-    if unknown := next((joint for joint, _ in places.values() if joint not in names), None):
-        raise ValueError(f"a site on {str(unknown)[:30]!r}")
-    found = {name: Site(joint, (t[0], t[1], t[2])) for name, (joint, t) in places.items()}
-    skeleton = Skeleton(row["name"], tuple(names), tuple(parents), t_parent_joint, found)
-    if "head" not in skeleton or not 0.5 <= skeleton.stature <= 2.6:
-        raise ValueError(f"a skeleton without a head, or {skeleton.stature:.2f} m high")
-    return skeleton
-
-
-def _number(value: Any, name: str, limit: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= limit:
-        raise ValueError(f"{name} of {str(value)[:30]}")
-    return float(value)
-
-
-def _numbers(values: Any, count: int, name: str, limit: float) -> list[float]:
-    if not isinstance(values, list) or len(values) != count:
-        raise ValueError(f"{name} is no list of {count} numbers")
-    return [_number(value, name, limit) for value in values]
+        found = require_layout(content, _File, path)
+        skeleton = found.skeleton.skeleton()
+        if "head" not in skeleton or len(skeleton) > MAX_JOINTS or not 0.5 <= skeleton.stature <= 2.6:
+            raise ValueError(f"a skeleton without a head, or {skeleton.stature:.2f} m high")
+        seats = {device: seat.seat() for device, seat in found.seats.items()}
+        return Setup(skeleton, seats, found.floor_m, tuple(found.notes))

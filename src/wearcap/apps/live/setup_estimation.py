@@ -1,7 +1,7 @@
 """The first minute of a wearer: height, floor, sides and seats of the devices, by themselves or guided step by step."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -116,7 +116,8 @@ class SetupEstimation:
 
     def redo(self) -> None:
         """Begin the step again."""
-        self._step_s, self._hold_s, self._progress, self._reason = self._looked_s, self._now_s, 0.0, ""
+        self._step_s = self._looked_s
+        self._again("")
 
     # --- samples --------------------------------------------------------------------------------------------------
 
@@ -327,9 +328,7 @@ class SetupEstimation:
         above = None if self._floor_m is None else head.v[:, 2].median().item() - self._floor_m
         for device, joint in placement.sides_of(places, self._missing, above).items():
             self._seats[device] = self._nominal(joint)
-            self.notes.append(
-                f"{_plain(joint)}: {device!r}, {abs(places[device].left_m):.2f} m to that side of the head."
-            )
+            self._note(joint, f"{device!r}, {abs(places[device].left_m):.2f} m to that side of the head.")
 
     def _place_watches(self, seen: dict[str, Window], sure: bool) -> None:
         """Find the sides of watches of unknown place: by how watches are usually worn, at last (`sure`) by their names."""
@@ -338,10 +337,10 @@ class SetupEstimation:
             missing = self._missing
             if joint in missing and joint is not None:
                 self._seats[device] = self._nominal(joint)
-                self.notes.append(f"{_plain(joint)}: {device!r}, as watches are usually worn. Check it on the page.")
+                self._note(joint, f"{device!r}, as watches are usually worn. Check it on the page.")
             elif sure and missing:
                 self._seats[device] = self._nominal(missing[0])
-                self.notes.append(f"{_plain(missing[0])}: {device!r}, by the order of names. Check it on the page.")
+                self._note(missing[0], f"{device!r}, by the order of names. Check it on the page.")
 
     def _seat_watch(self, device: str, rough: bool) -> None:
         """Seat and heading of a watch on a hanging arm."""
@@ -352,13 +351,13 @@ class SetupEstimation:
             seat = replace(seat, R_joint_device=mount)
         R_ref_joint = R @ seat.R_joint_device.mT
         if not known and mount is None:
-            self.notes.append(f"{_plain(seat.joint)}: its z axis is along the arm; taken as mounted along the joint.")
+            self._note(seat.joint, "its z axis is along the arm; taken as mounted along the joint.")
         elif not placement.arm_is_down(R_ref_joint, seat.joint):
-            self.notes.append(f"{_plain(seat.joint)}: the arm did not hang; its heading is a guess.")
+            self._note(seat.joint, "the arm did not hang; its heading is a guess.")
         yaw = placement.hanging_yaw(R_ref_joint, seat.joint, self._heading)
         self._seats[device] = replace(seat, yaw_rad=yaw)
         if rough:
-            self.notes.append(f"{_plain(seat.joint)}: seat and heading are rough, from an arm that hangs.")
+            self._note(seat.joint, "seat and heading are rough, from an arm that hangs.")
 
     # --- guided ---------------------------------------------------------------------------------------------------
 
@@ -369,14 +368,7 @@ class SetupEstimation:
         if not self._steps:
             self._finish()
             return
-        does: dict[str, Callable[[], bool]] = {
-            STAND: self._stand,
-            ARMS: self._arms,
-            TURN: self._turn,
-            RAISE: self._raise,
-            WALK: self._walk,
-        }
-        if does[self._steps[0]]():
+        if getattr(self, f"_{self._steps[0]}")():  # `_stand`, `_arms`, `_turn`, `_raise`, `_walk`
             self._next()
         elif now_s - self._step_s > STEP_S:
             self._leave(f"{SENTENCES[self._steps[0]][:-1]!r} took too long: a default stands for what it finds.")
@@ -391,7 +383,19 @@ class SetupEstimation:
 
     def _next(self) -> None:
         self._steps.pop(0)
-        self._step_s, self._hold_s, self._progress, self._reason = self._looked_s, self._now_s, 0.0, ""
+        self.redo()
+
+    def _again(self, reason: str) -> bool:
+        """The wearer does not do as the step says, for a reason; False."""
+        self._hold_s, self._progress, self._reason = self._now_s, 0.0, reason
+        return False
+
+    def _name(self, device: str) -> str:
+        """A device by its joint, if that is known, at the beginning of a sentence."""
+        return _plain(self._seats[device].joint if device in self._seats else device)
+
+    def _note(self, joint: str, what: str) -> None:
+        self.notes.append(f"{_plain(joint)}: {what}")
 
     def _leave(self, note: str) -> None:
         """Leave the step with a note and what can be known without it."""
@@ -410,17 +414,13 @@ class SetupEstimation:
         for device in (HEAD, *devices):
             window = self._window(device, max(self._hold_s, self._now_s - 0.6))
             whole = self._window(device, self._hold_s)
-            name = _plain(self._seats[device].joint if device in self._seats else device)
+            name = self._name(device)
             if self._now_s - self._hold_s < 0.5:
                 continue
             if window is None or whole is None:
-                self._reason = f"{name} sends nothing."
-            elif _sways(whole) if device == HEAD else placement.moves(whole, self._seen[device].watch):
-                self._reason = f"{name} still moves."
-            else:
-                continue
-            self._hold_s, self._progress = self._now_s, 0.0
-            return False
+                return self._again(f"{name} sends nothing.")
+            if _sways(whole) if device == HEAD else placement.moves(whole, self._seen[device].watch):
+                return self._again(f"{name} still moves.")
         held = self._now_s - self._hold_s
         self._progress = held / HOLD_S
         if held >= 1.0:
@@ -433,8 +433,7 @@ class SetupEstimation:
         raw = self._seen[HEAD].between(self._hold_s, self._now_s)
         level = None if raw is None else placement.level_head(raw.R)
         if level is None:
-            self._reason, self._hold_s, self._progress = "Look straight ahead.", self._now_s, 0.0
-            return False
+            return self._again("Look straight ahead.")
         self._head = replace(self._head, R_joint_device=level)
         head = self._window(HEAD, self._hold_s)
         assert head is not None
@@ -462,9 +461,7 @@ class SetupEstimation:
         if self.tracked:
             raised = next((device for device, one in seen.items() if placement.placed(head, one).below_m < 0.25), None)
             if raised is not None:
-                name = _plain(self._seats[raised].joint if raised in self._seats else raised)
-                self._reason, self._hold_s, self._progress = f"{name} is not down yet.", self._now_s, 0.0
-                return False
+                return self._again(f"{self._name(raised)} is not down yet.")
             self._place_trackers(head, seen)
         self._hanging = {device: window.R for device, window in seen.items()}
         self._hanging_m = {device: window.v[:, 2].median().item() for device, window in seen.items()}
@@ -485,9 +482,7 @@ class SetupEstimation:
             self._seats[device] = replace(
                 seat, R_joint_device=R_world_joint.mT @ R, t_joint_device=0 * seat.t_joint_device
             )
-            self.notes.append(
-                f"{_plain(seat.joint)}: {device!r} is not held like a controller; seated by the hanging arm."
-            )
+            self._note(seat.joint, f"{device!r} is not held like a controller; seated by the hanging arm.")
 
     def _turn(self) -> bool:
         """Find the offsets of watches' clocks once all have turned to and fro, and rest again.
@@ -498,7 +493,7 @@ class SetupEstimation:
         worn = [device for device in self._seen if device in self._seats or (device != HEAD and self._missing)]
         watches = {device: self._track(device, start_s) for device in worn}
         head, over = self._track(HEAD, start_s), self._looked_s - self._step_s > STEP_S
-        names = {device: _plain(self._seats[device].joint if device in self._seats else device) for device in watches}
+        names = {device: self._name(device) for device in watches}
         self._progress, self._reason = turned({"Head": head, **{names[device]: watches[device] for device in watches}})
         if not watches or (self._progress < 1.0 and not over):
             return over
@@ -529,7 +524,7 @@ class SetupEstimation:
         for joint, device in zip(WRISTS, [*raised, *others[:1]]):
             if joint in self._missing:
                 self._seats[device] = self._nominal(joint)
-                self.notes.append(f"{_plain(joint)}: {device!r}, by the raised left hand.")
+                self._note(joint, f"{device!r}, by the raised left hand.")
                 self._seat_hanging(device)
         return True
 
@@ -557,18 +552,13 @@ class SetupEstimation:
             return False
         for device, seat in list(self._seats.items()):
             watch = None if seat.joint not in WRISTS else self._window(device, head.timestamps[0].item())
-            yaw = (
-                None
-                if watch is None
-                else placement.swing_yaw(walk, watch, seat.R_joint_device, seat.joint, seat.yaw_rad)
-            )
+            guess = seat.yaw_rad
+            yaw = None if watch is None else placement.swing_yaw(walk, watch, seat.R_joint_device, seat.joint, guess)
             if yaw is not None:
                 self._seats[device] = replace(seat, yaw_rad=yaw)
-                self.notes.append(f"{_plain(seat.joint)}: its heading is by the swing of the arm while walking.")
+                self._note(seat.joint, "its heading is by the swing of the arm while walking.")
             elif seat.joint in WRISTS:
-                self.notes.append(
-                    f"{_plain(seat.joint)}: the arm hardly swings; its heading is by the hanging arm, rough."
-                )
+                self._note(seat.joint, "the arm hardly swings; its heading is by the hanging arm, rough.")
         return True
 
     # --- end ------------------------------------------------------------------------------------------------------
@@ -576,7 +566,7 @@ class SetupEstimation:
     def _finish(self) -> None:
         """Write up what was found; required wrists without a device get the nominal seat under their own name."""
         for joint in self._missing:
-            self.notes.append(f"{_plain(joint)}: no device was seen.")
+            self._note(joint, "no device was seen.")
             self._seats[joint] = self._nominal(joint)
         seats = {device: seat for device, seat in self._seats.items() if seat.joint in WRISTS}
         if HEAD in self.requires:

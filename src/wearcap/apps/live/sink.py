@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import ClassVar
 
+from wearcap.apps.live.status import SinkStatus
 from wearcap.body.skeleton import Skeleton
 from wearcap.recording import Motion
 
@@ -74,15 +75,23 @@ class SinkThread:
     def end(self, wearer: str) -> None:
         self._put(False, lambda: self.sink.end(wearer))
 
-    def close(self, seconds: float = 10.0) -> None:
-        """Let the sink take what waits for it, for at most so many seconds, and close it; the rest counts as dropped."""
+    def finish(self) -> None:
+        """Let the sink take what waits for it, and close it, in its own time."""
         with self._ready:
             self._closing = True
             self._ready.notify()
+
+    def close(self, seconds: float = 10.0) -> None:
+        """Let the sink take what waits for it, for at most so many seconds, and close it; the rest counts as dropped."""
+        self.finish()
         self._thread.join(seconds)
         with self._ready:
             self.dropped += sum(droppable for droppable, _ in self._calls)
             self._calls.clear()
+
+    def status(self) -> SinkStatus:
+        """What page and report show."""
+        return SinkStatus(self.sink.name, self.sink.sent, self.dropped, self.failed, self.last_error)
 
     def _put(self, droppable: bool, call: Callable[[], None]) -> None:
         with self._ready:

@@ -4,10 +4,10 @@ import asyncio
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Awaitable, Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 from urllib.parse import parse_qs, urlsplit
 
 from wearcap.apps.live.packets import Inbox, Packet
@@ -25,6 +25,25 @@ sender shall lose messages."""
 MAX_SENDERS, FORGOTTEN_S = 64, 60
 """Senders of a source that are known at a time, and the time (s) of silence after which one is not."""
 TOO_MANY = "too many messages"
+
+
+class Fault(Exception):
+    """Why a message, or a part of one, cannot be used."""
+
+
+def require(fault: str | None) -> None:
+    """Raise a fault, if there is one."""
+    if fault is not None:
+        raise Fault(fault)
+
+
+@contextmanager
+def counted(refuse: Callable[[str], None]) -> Iterator[None]:
+    """A fault is counted, and ends what is in here."""
+    try:
+        yield
+    except Fault as fault:
+        refuse(str(fault))
 
 
 class Budget:
@@ -88,6 +107,16 @@ class _Spent:
     """Second of the last message."""
 
 
+class Addressed:
+    """A source or a sink that an address names."""
+
+    port: ClassVar[int]
+    """Default port."""
+
+
+Kind = TypeVar("Kind", bound=Addressed)
+
+
 @dataclass(frozen=True)
 class Address:
     """Where a source listens or a sink sends: "vmc://127.0.0.1:39540?wearer=anna"."""
@@ -117,22 +146,41 @@ class Address:
                 raise WearcapError(f"no option {name!r}", f"{self.scheme}://", fix=nearest(name, ("wearer", *allowed)))
 
 
-class Source(ABC):
+def addressed(
+    text: str, kinds: Mapping[str, type[Kind]], what: str, setting: str, host: Callable[[type[Kind]], str]
+) -> tuple[type[Kind], Address]:
+    """The kind that an address names, and the address ("vmc" alone: the defaults); `what` it is and which `setting` it comes
+    from, for errors; `host`: where a kind is unless the address says so.
+
+    Raises WearcapError for an unknown scheme, and for anything that is no address.
+    """
+    scheme, separator, _ = text.partition("://")
+    if scheme not in kinds:
+        fault = f"no {what} is called {scheme[:40]!r}"
+        raise WearcapError(fault, f"{setting}={text[:80]}", "SCHEME://HOST:PORT", nearest(scheme, kinds))
+    kind = kinds[scheme]
+    return kind, Address.of(text if separator else f"{scheme}://", kind.port, host(kind))
+
+
+class Source(Addressed, ABC):
     """Something that delivers packets while it runs; it never raises for what comes from the network."""
 
     scheme: ClassVar[str]
     """Scheme of its addresses ("vmc")."""
-    port: ClassVar[int]
-    """Default port."""
     hz: ClassVar[float]
     """Nominal rate of each device's packets (Hz)."""
     convention: ClassVar[str]
     """Axes and units of what is received, as text for people."""
     lossless: ClassVar[bool] = False
     """Whether all that it delivers must be captured, however late the capture is."""
+    own_options: ClassVar[tuple[str, ...]] = ()
+    """Options of its addresses beside `wearer`."""
+    patient: ClassVar[bool] = False
+    """Whether its wearer stays while nothing comes."""
 
     def __init__(self, address: Address):
         """Listen at an address. Raises WearcapError for options that the source does not have."""
+        address.require_options(*self.own_options)
         self.address = address
         self.wearer = address.options.get("wearer", "")
         self.listens = False
@@ -172,12 +220,18 @@ class DatagramSource(Source):
     """A source that reads one UDP socket; a subclass understands one datagram at a time."""
 
     @abstractmethod
-    def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
-        """The packets of one datagram.
+    def packets(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterable[Packet | None]:
+        """The packets of one datagram, None for parts that are none.
 
-        Whatever the bytes are, it returns within milliseconds, raises nothing and allocates no more than a small multiple
-        of their number; what cannot be used is counted by `refuse(reason)`, whose reasons are few and fixed.
+        Whatever the bytes are, it returns within milliseconds, raises nothing but Fault and allocates no more than a small
+        multiple of their number; what cannot be used is counted by `refuse(reason)`, whose reasons are few and fixed.
         """
+
+    def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
+        """The packets of one datagram; raises nothing."""
+        with counted(refuse):
+            return [packet for packet in self.packets(data, arrived_s, refuse) if packet is not None]
+        return []
 
     def take(self, data: bytes, inbox: Inbox, sender: Hashable = None) -> bool:
         """Deliver what is in a message, within the limits; whether there was anything."""
@@ -196,20 +250,29 @@ class DatagramSource(Source):
         return bool(packets)
 
     async def run(self, inbox: Inbox) -> None:
-        loop = asyncio.get_running_loop()
         try:
-            transport, _ = await loop.create_datagram_endpoint(
-                lambda: _Receiver(self, inbox), local_addr=(self.address.host, self.address.port)
-            )
+            end = await self.listen(inbox)
         except OSError as error:
             raise self.cannot_listen(error) from error
         self.listens = True
-        endpoint: socket.socket = transport.get_extra_info("socket")
-        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         try:
             await asyncio.Event().wait()
         finally:
+            await end()
+
+    async def listen(self, inbox: Inbox) -> Callable[[], Awaitable[None]]:
+        """Begin to deliver what comes; returns what ends it. Raises OSError when the address cannot be used."""
+        loop = asyncio.get_running_loop()
+        transport, _ = await loop.create_datagram_endpoint(
+            lambda: _Receiver(self, inbox), local_addr=(self.address.host, self.address.port)
+        )
+        endpoint: socket.socket = transport.get_extra_info("socket")
+        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+
+        async def end() -> None:
             transport.close()
+
+        return end
 
 
 class _Receiver(asyncio.DatagramProtocol):

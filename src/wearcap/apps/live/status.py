@@ -1,8 +1,10 @@
 """State of a running capture, as its page and its report show it, and what a page may ask of the capture."""
 
-from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+import math
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,13 +16,41 @@ MAX_POINTS = 50_000
 """Most points of the surroundings in a status: the newest."""
 
 
-@dataclass(frozen=True)
-class Latency:
+class Latency(NamedTuple):
     """Quantiles (ms) of the time from a packet's device time to the pose that leaves; NaN before the first pose."""
 
-    median_ms: float = float("nan")
-    p95_ms: float = float("nan")
-    p99_ms: float = float("nan")
+    median: float = float("nan")
+    p95: float = float("nan")
+    p99: float = float("nan")
+
+
+NO_LATENCY = Latency()
+_BIN_MS, _LONGEST_MS = 0.5, 20_000.0
+
+
+class Latencies:
+    """Latencies of poses, as many as there are, in bounded memory: a histogram."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._bins = np.zeros(int(_LONGEST_MS / _BIN_MS) + 1, dtype=np.int64)
+
+    def add(self, seconds: Float[np.ndarray, "pose"]) -> None:
+        """Count some latencies (s); negative ones count as 0, those beyond 20 s as 20 s."""
+        bins = np.clip(1000.0 * seconds / _BIN_MS, 0, len(self._bins) - 1).astype(np.int64)
+        np.add.at(self._bins, bins, 1)
+        self.count += len(bins)
+
+    def quantile_ms(self, share: float) -> float:
+        """Smallest latency (ms) that a share of the poses does not exceed, rounded up to half a millisecond."""
+        if not self.count:
+            return math.nan
+        reached = np.searchsorted(self._bins.cumsum(), share * self.count)
+        return float(_BIN_MS * (reached + 1))
+
+    @property
+    def quantiles(self) -> Latency:
+        return Latency(*(self.quantile_ms(share) for share in (0.5, 0.95, 0.99)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +76,29 @@ class DeviceStatus:
         return title if self.joint in (None, self.name) else f"{title} ({self.name})"
 
 
+@dataclass(frozen=True)
+class Counts:
+    """What has happened to one wearer's packets and poses so far."""
+
+    frames: int = 0
+    """Number of poses."""
+    sessions: int = 0
+    """How often the capture of this wearer began."""
+    dropped: int = 0
+    """Number of the head's poses that its session dropped as late, doubled or refused, and of all packets that were left out
+    because the capture was behind."""
+    late: int = 0
+    """Number of packets that came too late to be used."""
+    gaps: int = 0
+    """Number of gaps in the head's path, those that a capture left while it caught up among them."""
+    unknown: int = 0
+    """Number of packets of devices that nobody wears."""
+    clock_restarts: int = 0
+    """How often devices' clocks were set anew."""
+    refused: dict[str, int] = field(default_factory=dict)
+    """Samples that the sessions refused, by reason."""
+
+
 @dataclass(frozen=True, eq=False)
 class WearerStatus:
     """One wearer."""
@@ -58,16 +111,8 @@ class WearerStatus:
     progress: float = 0.0
     """Of the step, 0…1."""
     devices: tuple[DeviceStatus, ...] = ()
-    latency: Latency = Latency()
-    frames: int = 0
-    """Number of poses so far."""
-    dropped: int = 0
-    """Number of the head's poses that its session dropped as late, doubled or refused, and of all packets that were left out
-    because the capture was behind."""
-    late: int = 0
-    """Number of packets that came too late to be used."""
-    gaps: int = 0
-    """Number of gaps in the head's path, those that a capture left while it caught up among them."""
+    latency: Latency = NO_LATENCY
+    counts: Counts = Counts()
     floor_m: float | None = None
     """Floor height (m) in the head's world."""
     points_world: Float[Tensor, "point 3"] | None = None
@@ -102,6 +147,11 @@ class LiveStatus:
     """Time since it started."""
 
 
+Ask = Literal["guide", "skip", "redo"]
+"""Begin a guided first minute, anew where there was one; go on to its next step, with defaults for this one; begin this step
+again."""
+
+
 @runtime_checkable
 class LiveControls(Protocol):
     """What a page asks of the capture; every method returns at once and may be called from any thread."""
@@ -111,14 +161,8 @@ class LiveControls(Protocol):
     def record(self, on: bool) -> None:
         """Start or stop recording."""
 
-    def guide(self, wearer: str) -> None:
-        """Begin the guided first minute of a wearer, anew where there was one."""
-
-    def skip(self, wearer: str) -> None:
-        """Go on to the next step, with defaults for this one."""
-
-    def redo(self, wearer: str) -> None:
-        """Begin the step again."""
+    def ask(self, action: Ask, wearer: str) -> None:
+        """Do something about a wearer's first minute."""
 
     def stop(self) -> None:
         """End the capture."""

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from wearcap.apps.live.clocks import Clocks
-from wearcap.apps.live.devices import Devices
-from wearcap.apps.live.latency import Latencies
+from wearcap.apps.live.devices import MAX_DEVICES, Device
 from wearcap.apps.live.packets import HEAD, SUIT, Packet
+from wearcap.apps.live.recent import Recent
 from wearcap.apps.live.setup import Setup
 from wearcap.apps.live.setup_estimation import SetupEstimation
-from wearcap.apps.live.status import MAX_POINTS, Stage, WearerStatus
+from wearcap.apps.live.status import MAX_POINTS, Counts, Latencies, Stage, WearerStatus
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -59,6 +59,8 @@ class Opener:
     takes_objects: bool
     estimation: Callable[[Setup | None, bool], SetupEstimation]
     """(set-up of last time, whether guided) → a new first minute."""
+    patient: bool = False
+    """Whether a wearer without packets stays: they come in pieces of any length."""
 
 
 @dataclass(eq=False)
@@ -70,12 +72,6 @@ class LiveWearer:
     setup: Setup | None = None
     """Known from the beginning; None: the first minute finds it."""
     stage: Stage = "waiting"
-    frames: int = 0
-    gaps: int = 0
-    sessions: int = 0
-    """How often the capture of this wearer began."""
-    unknown: int = 0
-    """Number of packets of devices that nobody wears."""
     latencies: Latencies = field(default_factory=Latencies)
     notes: list[str] = field(default_factory=list)
 
@@ -85,12 +81,12 @@ class LiveWearer:
         self.session: Session | None = None
         self.skeleton: Skeleton | None = None
         self.fps = 0.0
-        self._devices = Devices(self.opener.devices)
+        self._devices = Recent(MAX_DEVICES, lambda _: Device(), self.opener.devices.__contains__)
+        self._counted: Counter[str] = Counter()
+        """Frames, sessions, gaps, packets of unknown devices and those that were left out; of ended sessions, those dropped."""
         self._heard_s = -np.inf
         self._head_s = -np.inf
         self._points: Tensor | None = None
-        self._dropped = 0
-        """Head poses that earlier sessions dropped, and packets that were left out."""
         self._refused: Counter[str] = Counter()
         """Samples that earlier sessions refused, by reason."""
         self._frames_before = 0
@@ -109,14 +105,14 @@ class LiveWearer:
     def take(self, packet: Packet) -> None:
         """Take in one packet."""
         if isinstance(packet.sample, ActiveObject | ObjectSample) and not self.opener.takes_objects:
-            self.unknown += 1
+            self._counted["unknown"] += 1
         elif isinstance(packet.sample, ActiveObject):
             self._choose(packet)
         elif self._is_left_out(packet):
-            self._dropped += 1
+            self._counted["dropped"] += 1
             self._heard_s = time.monotonic()
         elif (time_s := self._time_of(packet)) is None:
-            self.unknown += 1
+            self._counted["unknown"] += 1
         else:
             self._hear(packet, time_s)
             self._pass_on(packet, _timed(packet.sample, time_s), time_s)
@@ -127,7 +123,7 @@ class LiveWearer:
 
     def _time_of(self, packet: Packet) -> float | None:
         """Time (s) of a packet on the leading clock; None for a device too many."""
-        device = self._devices.admit(packet.device)
+        device = self._devices.admit(packet.device, time.monotonic())
         if device is None:
             return None
         clock, sent_s = (ARRIVAL, packet.arrived_s) if packet.sent_s is None else (packet.clock, packet.sent_s)
@@ -160,7 +156,7 @@ class LiveWearer:
                 "The capture is slower than the packets come: end other programs, or give it more cores (threads=N)."
             )
         if self._leads(packet):
-            self.gaps += int(MAX_GAP_S < time_s - self._head_s < AWAY_S)
+            self._counted["gaps"] += int(MAX_GAP_S < time_s - self._head_s < AWAY_S)
             self._head_s = time_s
         if isinstance(sample, HeadSample) and sample.points_world is not None and len(sample.points_world):
             self._keep_points(sample.points_world)
@@ -175,7 +171,7 @@ class LiveWearer:
         if leads and not self._taken:
             self._activate(time_s)
         if (seated := self._seated(packet.device, sample)) is None:
-            self.unknown += 1
+            self._counted["unknown"] += 1
             return
         late_s = self.clocks.late_s if leads else 0.0
         if late_s:  # the session takes a watch for silent that stays behind the head: the head waits for the latest one
@@ -254,8 +250,9 @@ class LiveWearer:
         wearer = Wearer(setup.skeleton, R_wrist_imu=mounts, floor_m=setup.floor_m, **placed)
         self.session, self.skeleton, self.stage = self.opener.session(wearer), setup.skeleton, "live"
         self._taken, self._taken_before = False, self._taken
-        self._frames_before = self.frames
-        self.sessions, self.fps = self.sessions + 1, self.session.fps
+        self._frames_before = self._counted["frames"]
+        self._counted["sessions"] += 1
+        self.fps = self.session.fps
 
     def _seated(self, device: str, sample: Any) -> Any:
         """A device's sample as the session takes it, on the joint that wears it; None for a device that nobody wears."""
@@ -289,7 +286,7 @@ class LiveWearer:
                 self.first.look(now_s)
                 self._align()
             return []
-        if now_s - self._heard_s > AWAY_S:
+        if now_s - self._heard_s > AWAY_S and not self.opener.patient:
             return self.leave()
         found = self._final(ended=False)
         if found is None:
@@ -313,7 +310,7 @@ class LiveWearer:
         """Keep the counts of the session, which ends; what waits for a late watch is forgotten."""
         self._held.clear()
         if self.session is not None:
-            self._dropped += self.session.dropped[0]
+            self._counted["dropped"] += self.session.dropped[0]
             self._refused.update(self.session.refused[0])
             self.session, self.stage = None, "away"
 
@@ -322,10 +319,10 @@ class LiveWearer:
 
         Returns the last frames. A session that has given none goes on: its beginning may be what took so long.
         """
-        if self.session is None or self.frames == self._frames_before:
+        if self.session is None or self._counted["frames"] == self._frames_before:
             return []
         self._caught_up_s, self._head_s = now_s, -np.inf
-        self.gaps += 1
+        self._counted["gaps"] += 1
         self.note(
             "The capture was behind by seconds, or suspended: it left out what had come meanwhile, and began anew. "
             "End other programs, or give it more cores (threads=N)."
@@ -341,7 +338,7 @@ class LiveWearer:
             self._close()
             return None
         if found is not None:
-            self.frames += len(found)
+            self._counted["frames"] += len(found)
         return found
 
     # --- the page's wishes ------------------------------------------------------------------------------------------
@@ -354,33 +351,29 @@ class LiveWearer:
 
     def status(self) -> WearerStatus:
         """What the page shows; any thread may ask."""
-        step = None if self.first is None else self.first.step
-        session = self.session
+        step, setup, now_s = None if self.first is None else self.first.step, self.setup, time.monotonic()
+        seats = {} if setup is None else setup.seats
+        devices = list(self._devices.items())
         return WearerStatus(
             self.name,
             self.stage,
             None if step is None else str(step),
             0.0 if step is None else step.progress,
-            self._devices.status({} if self.setup is None else self.setup.seats),
+            tuple(device.status(name, seats.get(name), now_s) for name, device in devices),
             self.latencies.quantiles,
-            self.frames,
-            self._dropped + (0 if session is None else session.dropped[0]),
-            self._devices.late,
-            self.gaps,
-            None if self.setup is None else self.setup.floor_m,
+            self._counts([device for _, device in devices]),
+            None if setup is None else setup.floor_m,
             self._points,
             tuple(self.notes),
         )
 
-    @property
-    def silent_s(self) -> float:
-        """Time (s) since the last packet; infinite before the first."""
-        return time.monotonic() - self._heard_s
-
-    @property
-    def refused(self) -> dict[str, int]:
-        """Samples that the sessions refused, by reason."""
-        return dict(self._refused + Counter({} if self.session is None else self.session.refused[0]))
+    def _counts(self, devices: Sequence[Device]) -> Counts:
+        counted, refused = self._counted.copy(), self._refused
+        if (session := self.session) is not None:
+            counted["dropped"] += session.dropped[0]
+            refused = refused + Counter(session.refused[0])
+        late = sum(device.late for device in devices)
+        return Counts(**counted, late=late, clock_restarts=self.clocks.restarts, refused=dict(refused))
 
     def _keep_points(self, points: Tensor) -> None:
         kept = points if self._points is None else torch.cat([self._points, points])

@@ -45,7 +45,7 @@ class ObjectEditor(ServedPage):
         self.file, self._lock = file, threading.RLock()
         self._saved = self._shown = self.editing.revision
         self._selection = self.editing.selected
-        self._changed_at, self._problem, self._stroke = 0.0, "", 0
+        self._changed_at, self._not_before_s, self._problem, self._stroke = 0.0, 0.0, "", 0
         super().__init__("wearcap scene", host, port, "large")
         self.view = EditorView(self.server, scan)
         self._add_controls(title)
@@ -352,17 +352,14 @@ class ObjectEditor(ServedPage):
                 self._saved, self._problem = revision, ""
                 self._show_status()
 
-    def run(self, seconds: float = np.inf) -> None:
-        """Serve until interrupted, or for the given seconds; changes are saved after a moment of inactivity."""
-        begin, not_before = wall.monotonic(), 0.0
-        while not self._stopped and (now := wall.monotonic()) - begin < seconds:
-            if now > max(not_before, self._changed_at + SAVE_AFTER_S):
-                try:
-                    self.save()
-                except WearcapError as error:
-                    self._problem, not_before = f"not saved: {error}", now + TRY_AGAIN_S
-                    self._show_status()
-            wall.sleep(0.1)
+    def update(self, now_s: float) -> None:
+        """Save changes after a moment of inactivity."""
+        if now_s > max(self._not_before_s, self._changed_at + SAVE_AFTER_S):
+            try:
+                self.save()
+            except WearcapError as error:
+                self._problem, self._not_before_s = f"not saved: {error}", now_s + TRY_AGAIN_S
+                self._show_status()
 
     def stop(self) -> None:
         """Save unsaved changes, and close. Raises WearcapError if they cannot be written."""

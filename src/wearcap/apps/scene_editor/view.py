@@ -5,10 +5,10 @@ from urllib.parse import quote
 
 import numpy as np
 import viser
-from jaxtyping import Bool, Float, Int64, UInt8
+from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
-from wearcap.apps.viewer.page_layers import by_height
+from wearcap.apps.viewer.page_layers import add_cloud, by_height
 from wearcap.apps.web.page_text import fitting
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
@@ -20,6 +20,7 @@ SHOWN_POINTS, SHOWN_SELECTED, SHOWN_OF_OBJECT = 250_000, 80_000, 40_000
 SELECTED_COLOR, BOX_COLOR, BRUSH_COLOR, HINGE_COLOR = ((255, 120, 20), (30, 120, 240), (255, 120, 20), (220, 30, 120))
 TINTS = np.array([[70, 160, 150], [90, 110, 220], [190, 110, 190], [130, 170, 60], [210, 150, 60], [90, 170, 220]])
 CURRENT_TINT = np.array([230, 60, 130])
+LOOK = {"point_shape": "rounded", "point_shading": "flat"}
 _ARROW_M = 0.5
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)], np.float32)
 _EDGES = _CORNERS[[[a, a + step] for step in (1, 2, 4) for a in range(8) if not a & step]]
@@ -47,7 +48,6 @@ class EditorView:
         colors = scan.colors
         self._colors = by_height(scan.points, low, high).astype(np.uint8) if colors is None else colors
         self.point_m = 1.9 * _typical_spacing(scan.points[self._thinned])
-        self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]
         """The scan's points that are drawn."""
         self._objects: dict[str, _Shown] = {}
@@ -66,31 +66,13 @@ class EditorView:
         shown = self._thinned[left[self._thinned]]
         shown = shown[self.scan.points[shown, 2] <= top_m]
         self.visible = self.scan.points[shown]
-        self._add_cloud("/scan", self.visible, self._colors[shown], self.point_m)
+        add_cloud(self.scene, "/scan", self.visible, self._colors[shown], self.point_m, **LOOK)
 
     def show_selection(self, selected: Int64[np.ndarray, "selected"]) -> None:
         """Draw the selection densely, slightly larger than the scan's own points, so that it covers them."""
         shown = selected[:: max(1, -(-len(selected) // SHOWN_SELECTED))]
         colors = np.broadcast_to(np.array(SELECTED_COLOR, np.uint8), (len(shown), 3))
-        self._add_cloud("/selection", self.scan.points[shown], colors, 1.8 * self.point_m)
-
-    def _add_cloud(
-        self, name: str, points: Float[np.ndarray, "shown 3"], colors: UInt8[np.ndarray, "shown 3"], size: float
-    ) -> None:
-        if not len(points):
-            self.scene.remove_by_name(name)
-            return
-        # Relative to the middle: float32 in the browser is exact to less than a millimetre there only.
-        self.scene.add_point_cloud(
-            name,
-            (points - self._center).astype(np.float32),
-            colors,
-            point_size=size,
-            precision="float32",
-            position=self._center,
-            point_shape="rounded",
-            point_shading="flat",
-        )
+        add_cloud(self.scene, "/selection", self.scan.points[shown], colors, 1.8 * self.point_m, **LOOK)
 
     def show_box(self, box: Box, visible: bool) -> None:
         self.box.visible = self.box_handle.visible = visible
@@ -132,13 +114,7 @@ class EditorView:
             vertices = mesh.vertices[::every]
             rows = np.broadcast_to(colors, vertices.shape).astype(np.uint8)
             handle = self.scene.add_point_cloud(
-                node,
-                vertices,
-                rows,
-                point_size=1.2 * self.point_m,
-                precision="float32",
-                point_shape="rounded",
-                point_shading="flat",
+                node, vertices, rows, point_size=1.2 * self.point_m, precision="float32", **LOOK
             )
         top = mesh.vertices[:, 2].max() + 0.1
         place = (0.0, 0.0, float(top))
@@ -277,8 +253,7 @@ class ObjectPanel:
         if self.choice.options != names:
             self.choice.options = names
         chosen = current.name if current is not None else names[0]
-        if self.choice.value != chosen:
-            self.choice.value = chosen
+        self.choice.value = chosen
         kind = current.freedom.kind if current is not None else None
         for control in (self.name, self.rename, self.kind, self.delete):
             control.visible = current is not None
@@ -290,26 +265,20 @@ class ObjectPanel:
         if current is None:
             return
         freedom = current.freedom
-        _write(self.name, current.name)
-        _write(self.kind, FREEDOMS[freedom.kind])
+        self.name.value = current.name
+        self.kind.value = FREEDOMS[freedom.kind]
         if freedom.kind == "hinge":
             low, high = np.rad2deg(_limits(freedom, np.pi))
-            _write(self.least_deg, round(low))
-            _write(self.greatest_deg, round(high))
+            self.least_deg.value = round(low)
+            self.greatest_deg.value = round(high)
             self.try_deg.min, self.try_deg.max = float(low), float(max(high, low + 1.0))
         if freedom.axis is not None:
             low, high = _limits(freedom, 2.0)
-            _write(self.least_m, round(low, 3))
-            _write(self.greatest_m, round(high, 3))
-            _write(self.direction, round(float(np.rad2deg(np.arctan2(freedom.axis[1], freedom.axis[0])))))
+            self.least_m.value = round(low, 3)
+            self.greatest_m.value = round(high, 3)
+            self.direction.value = round(float(np.rad2deg(np.arctan2(freedom.axis[1], freedom.axis[0]))))
             self.try_m.min, self.try_m.max = float(low), float(max(high, low + 0.01))
 
 
 def _limits(freedom: Freedom, widest: float) -> tuple[float, float]:
     return (-widest, widest) if freedom.limits is None else freedom.limits
-
-
-def _write(control, value) -> None:
-    """Set a control's value only if it has changed: a control that is being dragged must not jump."""
-    if control.value != value:
-        control.value = value

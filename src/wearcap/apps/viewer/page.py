@@ -3,7 +3,7 @@
 Python runs the clock and sends poses; the browser skins, draws and moves the camera.
 """
 
-import time as wall
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -22,7 +22,7 @@ from wearcap.apps.viewer.page_layers import (
     HeadLayer,
     LabelLayer,
     Layer,
-    MotionLayer,
+    MotionLayers,
     ObjectsLayer,
     add_points,
     poses_at,
@@ -89,62 +89,32 @@ class _Timeline:
         self.time = min(max(time, self.start), self.stop)
 
 
-@dataclass
-class _Placed:
-    """Layers of one motion, which are shown, hidden and shifted together."""
-
-    body: BodyLayer
-    feet: FeetLayer | None
-    points: MotionLayer | None = None
-    objects: MotionLayer | None = None
-    label: LabelLayer | None = None
-
-    @classmethod
-    def of(
-        cls,
-        server: viser.ViserServer,
-        name: str,
-        motion: Motion,
-        recording: Recording,
-        items: Sequence[SceneObject],
-        color: tuple[int, int, int],
-        several: bool,
-    ) -> "_Placed":
-        """A motion with its own moving objects; one of `several` is labelled, and its objects are tinted like its body."""
-        body, points, objects = surface_or_sticks(motion.skeleton, recording.shape), None, None
-        if motion.body_contact_prob is not None:
-            points = BodyPointsLayer(server, f"{name}_points", motion, body)
-        if items and motion.object_motion:
-            tint = color if several else None
-            objects = ObjectsLayer(server, f"{name}_objects", items, motion.object_motion, tint)
-        surface = BodyLayer(server, name, motion, body, color)
-        feet = FeetLayer.of(server, f"{name}_feet", motion, recording.contacts if name == TRUTH else None)
-        label = LabelLayer(server, name, motion) if several else None
-        return cls(surface, feet, points, objects, label)
-
-    @property
-    def layers(self) -> list[MotionLayer]:
-        every = (self.body, self.feet, self.points, self.objects)
-        return [layer for layer in every if layer is not None]
-
-    def place(self, offset: Float[np.ndarray, "3"], visible: bool, named: bool = False) -> None:
-        """`named` also shows the motion's label, if it has one."""
-        for layer in self.layers:
-            layer.place(offset, visible)
-        if self.label is not None:
-            self.label.place(offset, named)
-
-    def show(self, time: float) -> None:
-        if not self.body.handle.visible:
-            return
-        for layer in self.layers:
-            layer.show(time)
-        if self.label is not None:
-            self.label.show(time)
+def _layers(
+    server: viser.ViserServer,
+    name: str,
+    motion: Motion,
+    recording: Recording,
+    items: Sequence[SceneObject],
+    color: tuple[int, int, int],
+    several: bool,
+) -> MotionLayers:
+    """A motion with its own moving objects; one of `several` is labelled, and its objects are tinted like its body."""
+    body, points, objects = surface_or_sticks(motion.skeleton, recording.shape), None, None
+    if motion.body_contact_prob is not None:
+        points = BodyPointsLayer(server, f"{name}_points", motion, body)
+    if items and motion.object_motion:
+        tint = color if several else None
+        objects = ObjectsLayer(server, f"{name}_objects", items, motion.object_motion, tint)
+    surface = BodyLayer(server, name, motion, body, color)
+    feet = FeetLayer.of(server, f"{name}_feet", motion, recording.contacts if name == TRUTH else None)
+    label = LabelLayer(server, name, motion) if several else None
+    return MotionLayers(surface, feet, label, points, objects)
 
 
 class Page(ServedPage):
     """One recording's page. `run` plays until interrupted; `stop` closes the server."""
+
+    step_s = 1 / UPDATES_PER_S
 
     def __init__(
         self,
@@ -170,11 +140,11 @@ class Page(ServedPage):
         moving, tracks = [], [motion.object_motion or {} for motion in motions.values()]
         if environment is not None:
             moving = [item for item in environment.objects if any(_moves(of.get(item.name), item) for of in tracks)]
-        self.bodies: dict[str, _Placed] = {}
+        self.bodies: dict[str, MotionLayers] = {}
         for name, motion in motions.items():
             number = len(self.bodies) - (TRUTH in self.bodies)
             color = TRUTH_COLOR if name == TRUTH else COLORS[number % len(COLORS)]
-            self.bodies[name] = _Placed.of(self.server, name, motion, recording, moving, color, len(motions) > 1)
+            self.bodies[name] = _layers(self.server, name, motion, recording, moving, color, len(motions) > 1)
         self.layers: list[Layer] = list(self.bodies.values())
         self.aside_m = _spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
         if recording.head is not None and len(recording.head.timestamps):
@@ -187,6 +157,7 @@ class Page(ServedPage):
         if environment is not None:
             still = [item for item in environment.objects if item not in moving]
             self.layers.append(ObjectsLayer(self.server, "surroundings/objects", still, recording.object_motion))
+        self._updated_s, self._shown = math.inf, 0
         self.layout = BESIDE if len(self.bodies) - (TRUTH in self.bodies) > 1 else OVER
         floor_z = _floor_height(recording)
         self.server.scene.add_grid("/floor", infinite_grid=True, position=(0.0, 0.0, floor_z), fade_distance=25.0)
@@ -283,7 +254,7 @@ class Page(ServedPage):
 
     def _focus(self) -> np.ndarray:
         """Point that the camera looks at: the middle of the shown bodies, or the head."""
-        shown = [placed.body.handle.position for placed in self.bodies.values() if placed.body.handle.visible]
+        shown = [placed.body.handle.position for placed in self.bodies.values() if placed.visible]
         if shown:
             return np.mean(shown, axis=0)
         for layer in self.layers:
@@ -291,18 +262,14 @@ class Page(ServedPage):
                 return np.array(layer.frustum.position)
         return np.zeros(3)
 
-    def run(self, seconds: float = np.inf) -> None:
-        """Run the clock until interrupted, or for the given seconds."""
-        begin = last = wall.monotonic()
-        shown = 0
-        while not self._stopped and (now := wall.monotonic()) - begin < seconds:
-            if self.timeline.advance(now - last):
-                self.show()
-                shown += 1
-                if shown % 6 == 0:  # the slider need not be as smooth as the body
-                    self._show_time()
-            last = now
-            wall.sleep(max(0.0, 1 / UPDATES_PER_S - (wall.monotonic() - now)))
+    def update(self, now_s: float) -> None:
+        """Run the clock."""
+        elapsed_s, self._updated_s = now_s - min(self._updated_s, now_s), now_s
+        if self.timeline.advance(elapsed_s):
+            self.show()
+            self._shown += 1
+            if self._shown % 6 == 0:  # the slider need not be as smooth as the body
+                self._show_time()
 
 
 def _floor_height(recording: Recording) -> float:

@@ -1,17 +1,17 @@
 """Layers of the page; each moves to a time by sending poses, without resending meshes. Objects and contacts for pictures, too."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 from urllib.parse import quote
 
 import numpy as np
 import torch
 import trimesh
 import viser
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from wearcap.apps.web.page_text import fitting
@@ -49,6 +49,8 @@ class Layer(Protocol):
 
 class MotionLayer(Layer):
     """Layer of one motion, which can be shifted by an offset (m) and hidden; `handles` are its nodes."""
+
+    motion: Motion
 
     def __init__(self, *handles: viser.SceneNodeHandle):
         self.handles, self.offset = handles, np.zeros(3)
@@ -156,9 +158,7 @@ class FeetLayer(MotionLayer):
         touching = self.contact[nearest_frame(self.clock, time)]
         for ball, place, touch in zip(self.balls, places.double().numpy(), touching.tolist()):
             ball.position = place + self.offset
-            color = CONTACT_COLOR if touch else AIR_COLOR
-            if ball.color != color:
-                ball.color = color
+            ball.color = CONTACT_COLOR if touch else AIR_COLOR
 
 
 class HeadLayer:
@@ -193,19 +193,26 @@ def by_height(
 def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
     """A point cloud coloured by height; a large one is subsampled evenly."""
     points = cloud.points_world[:: max(1, -(-len(cloud.points_world) // MAX_POINTS))].double().numpy()
+    low, high = np.quantile(points[:, 2], [0.02, 0.98]) if len(points) else (0.0, 1.0)
+    add_cloud(server.scene, "/surroundings/points", points, by_height(points, low, high).astype(np.uint8), 0.012)
+
+
+def add_cloud(
+    scene: viser.SceneApi,
+    name: str,
+    points: Float[np.ndarray, "point 3"],
+    colors: UInt8[np.ndarray, "point 3"],
+    size_m: float,
+    **look: Any,
+) -> None:
+    """Points of a size, in place of those of this name before; `look` is viser's."""
     if not len(points):
+        scene.remove_by_name(name)
         return
-    low, high = np.quantile(points[:, 2], [0.02, 0.98])
-    # Half precision is exact to a millimetre only near the node, so the node is in the points' middle.
-    centre = points.mean(0)
-    server.scene.add_point_cloud(
-        "/surroundings/points",
-        (points - centre).astype(np.float32),
-        by_height(points, low, high).astype(np.uint8),
-        point_size=0.012,
-        position=centre,
-        precision="float32",
-    )
+    # What the browser draws is exact to a millimetre only near the node, so the node is in the points' middle.
+    centre = points.mean(0, dtype=np.float64)
+    near = (points - centre).astype(np.float32)
+    scene.add_point_cloud(name, near, colors, point_size=size_m, precision="float32", position=centre, **look)
 
 
 _SCENES: dict[str, Callable[[Path], Mesh]] = {
@@ -405,6 +412,52 @@ class ObjectsLayer(MotionLayer):
     def show(self, time: float) -> None:
         for item, handle in zip(self.objects, self.handles):
             pose = poses_at(self.tracks.get(item.name), item, torch.tensor([time], dtype=torch.float64))[0]
-            wxyz, position = (quat_wxyz_from_matrix(pose.R.double()).numpy(), pose.t.double().numpy() + self.offset)
-            if not (np.array_equal(wxyz, handle.wxyz) and np.array_equal(position, handle.position)):
-                handle.wxyz, handle.position = wxyz, position
+            handle.wxyz = quat_wxyz_from_matrix(pose.R.double()).numpy()
+            handle.position = pose.t.double().numpy() + self.offset
+
+
+@dataclass
+class MotionLayers:
+    """Layers of one motion, which are shown, hidden, shifted and removed together."""
+
+    body: BodyLayer
+    feet: FeetLayer | None = None
+    label: LabelLayer | None = None
+    points: MotionLayer | None = None
+    objects: MotionLayer | None = None
+
+    @property
+    def layers(self) -> list[MotionLayer]:
+        """All but the label."""
+        every = (self.body, self.feet, self.points, self.objects)
+        return [layer for layer in every if layer is not None]
+
+    @property
+    def visible(self) -> bool:
+        return bool(self.body.handle.visible)
+
+    def place(self, offset: Float[np.ndarray, "3"], visible: bool, named: bool = False) -> None:
+        """`named` also shows the motion's label, if it has one."""
+        for layer in self.layers:
+            layer.place(offset, visible)
+        if self.label is not None:
+            self.label.place(offset, named)
+
+    def show(self, time: float) -> None:
+        if self.visible:
+            for layer in (*self.layers, *([] if self.label is None else [self.label])):
+                layer.show(time)
+
+    def follow(self, motion: Motion) -> None:
+        """Show another motion of the same skeleton from now on."""
+        for layer in (self.body, self.feet, self.label):
+            if layer is not None:
+                layer.motion = motion
+        if self.feet is not None and motion.contact_prob is not None:
+            self.feet.contact, self.feet.clock = motion.contact_prob > 0.5, motion.timestamps
+
+    def remove(self) -> None:
+        """Remove the nodes."""
+        for layer in (*self.layers, *([] if self.label is None else [self.label])):
+            for handle in layer.handles:
+                handle.remove()

@@ -10,8 +10,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from websockets.asyncio.server import ServerConnection
-
 try:
     import resource
 except ModuleNotFoundError:  # Windows
@@ -76,20 +74,3 @@ class Connections:
 
 CONNECTIONS = Connections()
 """Those of this process."""
-
-
-class CountedConnection(ServerConnection):
-    """A connection of websockets' server that counts from the moment it is accepted."""
-
-    place: Connection | None = None
-
-    def connection_made(self, transport: Any) -> None:
-        super().connection_made(transport)
-        self.place = CONNECTIONS.enter(lambda: self.loop.call_soon_threadsafe(transport.abort))
-        if self.place is None:
-            transport.abort()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self.place is not None:
-            self.place.leave()
-        super().connection_lost(exc)

@@ -44,6 +44,13 @@ class Guard:
 
     host: str
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+    open: bool = False
+    """Whether requests need no token, only the right name and no foreign page."""
+
+    @classmethod
+    def of(cls, host: str, token: str | None) -> "Guard":
+        """A guard with a given token; without one, requests need none."""
+        return cls(host, open=True) if token is None else cls(host, token)
 
     def url(self, port: int) -> str:
         """The address to open, with the token."""
@@ -65,6 +72,8 @@ class Guard:
         origin = _single(headers, "Origin")
         if origin is not None and origin.lower() not in (f"http://{host}".lower(), f"https://{host}".lower()):
             raise Refused("only this server's own page may speak to it")
+        if self.open:
+            return HEADERS
         cookie = f"wearcap_token_{match[2] or 80}"  # cookies ignore ports, and several pages may be open
         if self._is_token(parse_qs(target.partition("?")[2]).get("token", [])):
             return HEADERS | {"Set-Cookie": f"{cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"}

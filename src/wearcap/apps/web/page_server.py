@@ -9,6 +9,7 @@ import math
 import secrets
 import socket
 import threading
+import time
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Literal
@@ -19,8 +20,9 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from wearcap.apps.web.connections import BACKLOG, DELIVERING, CountedConnection
+from wearcap.apps.web.connections import BACKLOG, DELIVERING
 from wearcap.apps.web.guard import Guard, Refused
+from wearcap.apps.web.sockets import CountedConnection
 from wearcap.errors import WearcapError
 
 _starting = threading.Lock()
@@ -119,6 +121,9 @@ def _check_host(host: str) -> None:
 class ServedPage:
     """A guarded page of viser with z up; `stop` ends its `run`."""
 
+    step_s: float = 0.1
+    """Time from one update to the next."""
+
     def __init__(self, label: str, host: str, port: int, control_width: Literal["medium", "large"]):
         self.guard = Guard(host)
         self.server = _start_server(self.guard, port, label)
@@ -132,7 +137,14 @@ class ServedPage:
         return self.guard.url(self.server.get_port())
 
     def run(self, seconds: float = math.inf) -> None:
-        """Follow the clock and save until interrupted, or for the given seconds."""
+        """Update the page until it is stopped, or for the given seconds."""
+        begin = time.monotonic()
+        while not self._stopped and (now := time.monotonic()) - begin < seconds:
+            self.update(now)
+            time.sleep(max(0.002, self.step_s - (time.monotonic() - now)))
+
+    def update(self, now_s: float) -> None:
+        """Do what is due at our time (s)."""
         raise NotImplementedError
 
     def serve(self) -> None:

@@ -5,8 +5,7 @@ constants. Each can be called alone, and is a stage whose result can be cached.
 """
 
 import functools
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
 from wearcap.recording import Motion, Recording
-from wearcap.recording.pieces import follow_pieces
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import resampled
 from wearcap.runtime.needs import CAMERA, CONTACTS, LOCALIZATION, SCAN, SUIT, Need
@@ -179,11 +177,6 @@ class HPS(StagedSystem):
         if "optimize" in results:
             about |= {"stopped": results["optimize"].reason, "energy": results["optimize"].history}
         return about
-
-    def follow(self, folder: Path, scan: Scan | None, refused: Counter[str]) -> Iterator[Motion]:
-        """Final pieces of motion of a recording that still grows in a folder; `refused` counts unusable pieces."""
-        pieces = follow_pieces(folder, refused=refused)
-        return self._room("stream", "captures streams").follow(self, pieces, scan, folder, refused=refused)
 
     def align(self, recording: Recording) -> Motion:
         """The suit's motion at `fps`, rotated about gravity and moved into the scene (thesis eq. 4.14, 4.15)."""

@@ -6,7 +6,7 @@ that follow. Memory is bounded by the window, however long the recording.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -160,10 +160,10 @@ class HpsStream:
         return sum(count for reason, count in self.refused.items() if reason.startswith("localization"))
 
     def take(self, sample: Any) -> None:
-        """Take in a `SuitPiece` with its localisation; or, as live devices send them, pieces of single frames and
-        `LocalizationSample`s, which are collected for `advance_s`. Anything else is refused."""
+        """Take in a `SuitPiece` with its localisation, if it has one; or, as live devices send them, pieces of single frames
+        and `LocalizationSample`s, which are collected for `advance_s`. Anything else is refused."""
         match sample:
-            case SuitPiece() if sample.localization is not None:
+            case SuitPiece(suit=Motion() as suit) if sample.localization is not None or len(suit) > 1:
                 self._push_collected()
                 self._push_piece(*sample)
             case SuitPiece():
@@ -437,52 +437,30 @@ class HpsSession(Session):
             raise WearcapError(what, expected="recording=FILE with the camera and its mount, and the scene's scan")
         return cls(system, [source.recording] * len(wearers), source.read_scan())
 
+    @classmethod
+    def of_piece(cls, system: HPS, piece: Recording, folder: Path, refused: Counter[str] | None) -> SuitPiece | None:
+        """A piece's camera is localised if it has images and no poses; file names in it are relative to `folder`.
 
-SESSION = HpsSession
-
-
-def follow(
-    hps: HPS,
-    pieces: Iterable[Recording],
-    scan: Scan | None,
-    folder: Path = Path(),
-    settings: StreamSettings | None = None,
-    refused: Counter[str] | None = None,
-) -> Iterator[Motion]:
-    """Capture a live recording piece by piece; file names in pieces are relative to `folder`.
-
-    A piece's camera is localised if it has images and no poses. Camera and suit must share a clock, as claps would be
-    detected too late. `refused` counts unusable pieces by reason (`HpsStream.refused`).
-    Raises WearcapError when the clocks are not shared, the first piece has no suit or cannot be localised, or a term
-    of the energy needs a scan that is missing.
-    """
-    stream: HpsStream | None = None
-    refused = Counter() if refused is None else refused
-    for piece in pieces:
-        if piece.suit is None and stream is None:
-            raise WearcapError("no suit in this piece", where=piece.name, expected="a suit's motion in each piece")
-        if hps.synchronization.by_claps(piece):
+        Camera and suit must share a clock, as claps would be detected too late; raises WearcapError otherwise.
+        """
+        if system.synchronization.by_claps(piece):
             fix = "Set the clocks before, and give pipeline.synchronization.clock=shared."
             raise WearcapError("a live recording cannot be synchronised by claps", where=piece.name, fix=fix)
         if piece.suit is None:
+            if refused is None:
+                raise WearcapError("no suit in this piece", where=piece.name, expected="a suit's motion in each piece")
             refused[f"suit: {WRONG_TYPE}"] += 1
-            continue
-        fresh = stream is None
-        if stream is None:
-            stream = HpsStream(hps, piece, scan, settings)
-            stream.refused = refused
+            return None
         localization = piece.localization
         if piece.camera is not None:
             try:
-                localization = hps.localization(piece, folder)
+                localization = system.localization(piece, folder)
             except WearcapError:
-                if fresh:
+                if refused is None:
                     raise
                 refused["localization: failed"] += 1
                 localization = None
-        done = stream.push(piece.suit, localization)
-        if done is not None:
-            yield done
-    last = stream.finish() if stream is not None else None
-    if last is not None:
-        yield last
+        return SuitPiece(piece.suit, localization)
+
+
+SESSION = HpsSession

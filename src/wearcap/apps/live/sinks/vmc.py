@@ -19,7 +19,7 @@ from torch import Tensor
 from wearcap.apps.live.pacing import Pacing
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sinks.objects import objects_of
-from wearcap.apps.live.source import Address
+from wearcap.apps.live.source import Address, Addressed
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -63,9 +63,10 @@ _CALIBRATED = 3
 """Of `/VMC/Ext/OK`: the performer is calibrated."""
 
 
-class VmcSink(Sink):
+class VmcSink(Sink, Addressed):
     """Sends one wearer's body: the one that the address names (`?wearer=NAME`), else the first that comes."""
 
+    port = 39539
     convention = "Unity's humanoid bones, objects as trackers; left-handed, y up, z forward, metres"
 
     def __init__(self, address: Address, pace: bool = True):

@@ -9,22 +9,20 @@ null}}: the pose of the object's mesh in the world, and the largest probability 
 
 import asyncio
 import json
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from http import HTTPStatus
 from typing import Any
 
-from websockets.asyncio.server import Server, ServerConnection, serve
-from websockets.http11 import Request, Response
+from websockets.asyncio.server import Server, ServerConnection, broadcast
 
 from wearcap.apps.live.pacing import Pacing
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sinks.objects import SeenObject, objects_of
-from wearcap.apps.live.source import Address
-from wearcap.apps.web.connections import BACKLOG, DELIVERING, SPOKEN, CountedConnection
-from wearcap.apps.web.guard import LOOPBACK, Guard, Refused
+from wearcap.apps.live.source import Address, Addressed
+from wearcap.apps.web.connections import DELIVERING, SPOKEN
+from wearcap.apps.web.guard import LOOPBACK, Guard
+from wearcap.apps.web.sockets import LoopThread, serve_sockets
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
@@ -32,31 +30,30 @@ from wearcap.recording import Motion
 
 CLOSE_S = 2.0
 """Time in which clients may close their connections at the end, before that is done for them."""
+MAX_CLIENT_BYTES = 1024
+"""Bytes of a message from a client, which nobody reads."""
 MAX_WAITING_BYTES = 1 << 20
 """Bytes that may wait for one client; a client that reads more slowly is disconnected."""
 
 
-class WebSocketSink(Sink):
+class WebSocketSink(Sink, Addressed):
     """Serves frames on an address; beyond loopback a client gives the token of the printed address."""
 
-    serves = True
+    port, serves = 9102, True
     convention = "JSON; wearcap's axes (x forward, y left, z up), metres, quaternions wxyz"
 
     def __init__(self, address: Address, pace: bool = True):
         """Raises WearcapError for options that the sink does not have."""
         address.require_options()
-        self.address, self.guard = address, Guard(address.host)
+        self.address, self.guard = address, Guard(address.host, open=address.host in LOOPBACK)
         self.name = f"ws://{address.host}:{address.port}"
         self.open_to_others = address.host not in LOOPBACK
         self.pace, self._paces = pace, dict[str, tuple[Pacing, float]]()
         """By wearer, when frames are due and the time of one (s): those of several are sent side by side."""
-        self._loop = asyncio.new_event_loop()
         self._server: Server | None = None
         self._last_s = 0.0
         """Our time (s) at which the last frame so far is due."""
         self._clients: set[ServerConnection] = set()
-        self._sending: set[asyncio.Task[None]] = set()
-        """Messages on their way: the loop itself refers to its tasks only weakly."""
         self._about: dict[str, str] = {}
         self.slow = 0
         """Number of clients disconnected because they read too slowly."""
@@ -64,46 +61,20 @@ class WebSocketSink(Sink):
     @property
     def url(self) -> str:
         """Address for clients, with the token where one is needed."""
-        if self.address.host in LOOPBACK:
+        if self.guard.open:
             return self.name
         return self.guard.url(self.address.port).replace("http://", "ws://", 1)
 
     def open(self) -> None:
-        ready: list[Any] = []
-        done = threading.Event()
-
-        async def begin() -> None:
-            try:
-                ready.append(
-                    await serve(
-                        self._client,
-                        self.address.host,
-                        self.address.port,
-                        process_request=self._admit,
-                        create_connection=CountedConnection,
-                        backlog=BACKLOG,
-                        open_timeout=5,
-                        max_size=1024,
-                        compression=None,
-                    )
-                )
-            except (OSError, UnicodeError) as error:  # the latter of a host's name
-                ready.append(error)
-            done.set()
-
-        def run() -> None:
-            asyncio.set_event_loop(self._loop)
-            self._loop.create_task(begin())
-            self._loop.run_forever()
-
-        self._thread = threading.Thread(target=run, name=self.name, daemon=True)
-        self._thread.start()
-        done.wait()
-        if isinstance(ready[0], Exception):
-            self._end_loop()
-            what = f"cannot serve here ({getattr(ready[0], 'strerror', None) or ready[0]})"
-            raise WearcapError(what, self.name, fix="Choose another port.") from ready[0]
-        self._server = ready[0]
+        self._thread = LoopThread(self.name)
+        self._loop, (host, port) = self._thread.loop, (self.address.host, self.address.port)
+        try:
+            serving = serve_sockets(self._client, host, port, self.guard, lambda _: None, MAX_CLIENT_BYTES)
+            self._server = self._thread.start(serving).result()
+        except (OSError, UnicodeError) as error:  # the latter of a host's name
+            self._thread.stop()
+            what = f"cannot serve here ({getattr(error, 'strerror', None) or error})"
+            raise WearcapError(what, self.name, fix="Choose another port.") from error
 
     def begin(self, wearer: str, skeleton: Skeleton, fps: float) -> None:
         self._paces[wearer] = Pacing(self.pace), 1 / fps
@@ -145,23 +116,8 @@ class WebSocketSink(Sink):
                 await asyncio.wait_for(server.wait_closed(), CLOSE_S)
 
         if self._server is not None:
-            asyncio.run_coroutine_threadsafe(end(self._server), self._loop).result()
-            self._end_loop()
-
-    def _end_loop(self) -> None:
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
-
-    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuses other sites' pages, and clients without the token beyond loopback."""
-        if self.address.host in LOOPBACK and request.headers.get("Origin") is None:
-            return None  # programs of this machine; a browser always names its page's origin
-        try:
-            self.guard.admit(request.path, request.headers)
-        except Refused as refused:
-            return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
-        return None
+            self._thread.start(end(self._server)).result()
+            self._thread.stop()
 
     async def _client(self, connection: Any) -> None:
         connection.place.rise(DELIVERING if self.open_to_others else SPOKEN)  # with its token it is the user's
@@ -192,10 +148,7 @@ class WebSocketSink(Sink):
                 self.slow += 1
                 self._clients.discard(client)
                 client.transport.abort()
-                continue
-            task = self._loop.create_task(_sent(client, text))
-            self._sending.add(task)
-            task.add_done_callback(self._sending.discard)
+        broadcast(self._clients, text)
 
 
 def _frame(wearer: str, motion: Motion, k: int, objects: dict[str, SeenObject]) -> str:
@@ -220,10 +173,3 @@ def _row(seen: SeenObject) -> dict[str, Any]:
         "rotation_wxyz": [round(each, 6) for each in wxyz.tolist()],
         "contact": None if seen.contact is None else round(seen.contact, 3),
     }
-
-
-async def _sent(client: ServerConnection, text: str) -> None:
-    try:
-        await asyncio.wait_for(client.send(text), 5.0)
-    except Exception:  # the client has left
-        client.transport.abort()

@@ -10,25 +10,21 @@
 
 import asyncio
 import contextlib
-import logging
 import secrets
-from collections.abc import Callable
-from http import HTTPStatus
+from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import msgspec
 import numpy as np
 import torch
-from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request, Response
 
 from wearcap.apps.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet, Sample
-from wearcap.apps.live.source import Address, Budget, DatagramSource
+from wearcap.apps.live.source import Address, Budget, DatagramSource, Fault, counted, require
 from wearcap.apps.live.sources.parts import AXES, BAD_NAME, Names, checked_pose, matrix_of
-from wearcap.apps.live.sources.posts import admitting
-from wearcap.apps.web.connections import BACKLOG, DELIVERING, SPOKEN, CountedConnection
-from wearcap.apps.web.guard import Refused
+from wearcap.apps.web.connections import DELIVERING, SPOKEN
+from wearcap.apps.web.guard import Guard
+from wearcap.apps.web.sockets import serve_sockets
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -41,8 +37,6 @@ MAX_MESSAGE, MAX_POINTS_MESSAGE = 1 << 16, 1 << 20
 """Bytes of a message over WebSocket; the larger one for messages with points."""
 MAX_POINTS = 20_000
 MAX_BYTES_PER_S = 1 << 22
-_QUIET = logging.Logger("wearcap.apps.live", logging.CRITICAL + 1)
-"""What goes wrong with a connection is counted, not printed."""
 
 NO_JSON = "no JSON object"
 UNKNOWN_KEY = "unknown key"
@@ -79,49 +73,39 @@ class _Message(msgspec.Struct):
 _NAMES = ("device", "wearer", "clock", "object", "active_object")
 
 
-class _Fault(Exception):
-    """Why a message cannot be used."""
-
-
 class JsonSource(DatagramSource):
     """Whatever an adapter sends as JSON datagrams."""
 
     scheme, port, hz = "json", 9100, 60.0
     convention = "JSON: metres, m/s², seconds; quaternion w x y z; x forward, y left, z up unless it says other axes"
-    own_options: tuple[str, ...] = ()
 
     def __init__(self, address: Address):
         super().__init__(address)
-        address.require_options(*self.own_options)
         self._names = {kind: Names() for kind in ("device", "object", "wearer", "clock")}
 
-    def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
-        packets = []
+    def packets(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[Packet]:
         lines = [line for line in data.split(b"\n", MAX_LINES) if line.strip()]
         if len(lines) > MAX_LINES:
             refuse(TOO_LARGE)
         for line in lines[:MAX_LINES]:
-            try:
-                packets.append(self._packet(line, arrived_s, refuse))
-            except WearcapError:
-                refuse(NO_JSON)
-            except _Fault as fault:
-                refuse(str(fault))
-        return packets
+            with counted(refuse):
+                yield self._packet(line, arrived_s, refuse)
 
     def _packet(self, line: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Packet:
-        content = parse_json(line, "message", "message")
-        if not isinstance(content, dict):
-            raise _Fault(NO_JSON)
+        try:
+            content = parse_json(line, "message", "message")
+        except WearcapError as error:
+            raise Fault(NO_JSON) from error
+        require(None if isinstance(content, dict) else NO_JSON)
         if not content.keys() <= set(_Message.__struct_fields__):
             refuse(UNKNOWN_KEY)  # and used without it
         try:
             message = msgspec.convert(content, _Message)
         except msgspec.ValidationError as error:
             key = str(error).rpartition("`$.")[2].rstrip("`")
-            raise _Fault(BAD_NAME if key in _NAMES else UNKNOWN_AXES if key == "axes" else WRONG_TYPE) from error
+            raise Fault(BAD_NAME if key in _NAMES else UNKNOWN_AXES if key == "axes" else WRONG_TYPE) from error
         if message.time is not None:
-            _require(time_fault(message.time))
+            require(time_fault(message.time))
         timestamp = arrived_s if message.time is None else message.time
         device, sample = self._about(message, timestamp, arrived_s)
         wearer = self._name("wearer", message.wearer, arrived_s) or self.wearer
@@ -135,22 +119,22 @@ class JsonSource(DatagramSource):
         device = self._name("device", message.device, arrived_s)
         name = self._name("object", message.object, arrived_s)
         if (chosen is not msgspec.UNSET) + (device is not None) + (name is not None) > 1:
-            raise _Fault(SEVERAL)
+            raise Fault(SEVERAL)
         if chosen is not msgspec.UNSET:
             return OBJECT, ActiveObject(self._name("object", chosen, arrived_s), timestamp)
         if message.axes not in AXES:
-            raise _Fault(UNKNOWN_AXES)
+            raise Fault(UNKNOWN_AXES)
         if name is not None:
             return f"{OBJECT} {name}", ObjectSample(name, timestamp, _pose(message))
         if device == SUIT or device is None:
-            raise _Fault(NO_DEVICE)
+            raise Fault(NO_DEVICE)
         return device, _sample(device, timestamp, message)
 
     def _name(self, kind: str, name: str | None, arrived_s: float) -> str | None:
         """A name of a kind; None where there is none."""
         if not name:
             return None
-        _require(self._names[kind].fault(name, arrived_s))
+        self._names[kind].entry(name, arrived_s)
         return name
 
 
@@ -158,55 +142,42 @@ def _sample(device: str, timestamp: float, message: _Message) -> Sample:
     if device == HEAD:
         pose, floor = None if message.lost else _pose(message), message.floor
         if floor is not None:
-            _require(number_fault(floor, MAX_POSITION_M))
+            require(number_fault(floor, MAX_POSITION_M))
         points = None if message.points is None else _points(message.points, message.axes)
         return HeadSample(timestamp, pose, points, floor_height=floor)
     if message.lost:
-        raise _Fault(NO_POSE)
+        raise Fault(NO_POSE)
     if device == CAMERA:
-        _require(number_fault(message.confidence, 1.0))
+        require(number_fault(message.confidence, 1.0))
         return LocalizationSample(timestamp, _pose(message), max(0.0, message.confidence))
     if message.acceleration is None:
         return WristSample(device, timestamp, _pose(message))
-    R = checked_pose((0.0, 0.0, 0.0), _rotation(message), message.axes)
+    R = checked_pose((0.0, 0.0, 0.0), _rotation(message), message.axes).R
     acc = torch.tensor(message.acceleration)
-    _require(R if isinstance(R, str) else values_fault(acc, (3,), MAX_ACC_M_S2))
-    assert isinstance(R, Rigid)
-    return WatchSample(timestamp, R.R, AXES[message.axes] @ acc, device)
-
-
-def _require(fault: str | None) -> None:
-    if fault is not None:
-        raise _Fault(fault)
+    require(values_fault(acc, (3,), MAX_ACC_M_S2))
+    return WatchSample(timestamp, R, AXES[message.axes] @ acc, device)
 
 
 def _rotation(message: _Message) -> torch.Tensor:
     if message.rotation_wxyz is not None:
-        R = matrix_of(message.rotation_wxyz)
-        if isinstance(R, str):
-            raise _Fault(R)
-        return R
-    if message.matrix is None:
-        raise _Fault(NO_POSE)
+        return matrix_of(message.rotation_wxyz)
+    require(NO_POSE if message.matrix is None else None)
     return torch.tensor(message.matrix)
 
 
 def _pose(message: _Message) -> Rigid:
     if message.position is None:
-        raise _Fault(NO_POSE)
-    pose = checked_pose(message.position, _rotation(message), message.axes)
-    if isinstance(pose, str):
-        raise _Fault(pose)
-    return pose
+        raise Fault(NO_POSE)
+    return checked_pose(message.position, _rotation(message), message.axes)
 
 
 def _points(rows: list[_Vector], axes: str) -> torch.Tensor:
     """Points of the surroundings, "point 3" (m)."""
     if len(rows) > MAX_POINTS:
-        raise _Fault(WRONG_TYPE)
+        raise Fault(WRONG_TYPE)
     with np.errstate(over="ignore"):  # becomes infinite, which is refused
         points = torch.from_numpy(np.array(rows, np.float64).reshape(-1, 3).astype(np.float32))
-    _require(values_fault(points, (len(rows), 3), MAX_POSITION_M))
+    require(values_fault(points, (len(rows), 3), MAX_POSITION_M))
     return points @ AXES[axes].T
 
 
@@ -226,45 +197,21 @@ class WebSocketSource(JsonSource):
     def url(self) -> str:
         return f"{super().url}/" + (f"?token={self.token}" if self.token else "")
 
-    async def run(self, inbox: Inbox) -> None:
-        admit = admitting(self.address.host, self.token or None)
+    async def listen(self, inbox: Inbox) -> Callable[[], Awaitable[None]]:
+        server = await serve_sockets(
+            lambda connection: self._listen(connection, inbox),
+            self.address.host,
+            self.address.port,
+            Guard.of(self.address.host, self.token or None),
+            lambda why: inbox.refuse(self.name, why),
+            MAX_POINTS_MESSAGE,
+        )
 
-        def admitted(connection: ServerConnection, request: Request) -> Response | None:
-            """An answer that ends a handshake, or None to go on."""
-            try:
-                admit(request.path, request.headers)
-            except Refused as refused:
-                inbox.refuse(self.name, "forbidden")
-                return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
-            return None
-
-        try:
-            server = await self._server(lambda connection: self._listen(connection, inbox), admitted)
-        except OSError as error:
-            raise self.cannot_listen(error) from error
-        self.listens = True
-        try:
-            await asyncio.Event().wait()
-        finally:
+        async def end() -> None:
             server.close()
             await server.wait_closed()
 
-    async def _server(self, listen: Any, admitted: Any) -> Server:
-        return await serve(
-            listen,
-            self.address.host,
-            self.address.port,
-            process_request=admitted,
-            create_connection=CountedConnection,
-            backlog=BACKLOG,
-            compression=None,  # a small message could unpack to a large one
-            max_size=MAX_POINTS_MESSAGE,
-            max_queue=16,
-            open_timeout=5,
-            close_timeout=1,
-            server_header=None,
-            logger=_QUIET,
-        )
+        return end
 
     async def _listen(self, connection: Any, inbox: Inbox) -> None:
         """Deliver what one adapter sends."""

@@ -13,7 +13,7 @@ left-handed, has another order of segments, and poses relative to their parents:
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.apps.live.packets import SUIT, Packet
-from wearcap.apps.live.source import Address, DatagramSource
+from wearcap.apps.live.source import Address, DatagramSource, Fault, require
 from wearcap.apps.live.sources.parts import UNIT_TOLERANCE
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import Site, Skeleton, xsens23
@@ -105,44 +105,32 @@ class MvnSource(DatagramSource):
         "Xsens MVN, types 02 and 13: metres (or centimetres), quaternion w x y z; z up, x forward, y left (up=y: y up)"
     )
 
+    own_options = ("up",)
+
     def __init__(self, address: Address):
         super().__init__(address)
-        address.require_options("up")
         self.up = address.options.get("up", "z")
         require_choice(self.up, ("z", "y"), f"up={self.up[:20]}")
         self._characters: dict[int, _Character] = {}
         self._xsens23 = xsens23()
         self._order = [SEGMENTS.index(name) for name in self._xsens23.joint_names]
 
-    def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
-        if len(data) < _HEADER.size or data[:4] != b"MXTP":
-            refuse(NO_MVN)
-            return []
+    def packets(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[Packet]:
+        require(NO_MVN if len(data) < _HEADER.size or data[:4] != b"MXTP" else None)
         kind, counter, part, items, time_ms, number, *_ = _HEADER.unpack_from(data)
-        if kind not in (b"MXTP02", b"MXTP13"):
-            refuse(OTHER_TYPE)
-            return []
+        require(None if kind in (b"MXTP02", b"MXTP13") else OTHER_TYPE)
         character = self._characters.setdefault(number, _Character(arrived_s))
         if kind == b"MXTP13":
-            self._take_size(character, data[_HEADER.size :], arrived_s, refuse)
-            return []
-        sample = self._joined(character, counter, part, data, items, refuse)
-        if sample is None:
-            return []
-        motion = self._motion(character, sample.poses, time_ms / 1000, arrived_s, refuse)
-        if motion is None:
-            return []
-        wearer = self.wearer if number == 0 else f"{self.wearer or 'character'} {number}"
-        return [Packet(wearer, SUIT, self.name, time_ms / 1000, arrived_s, SuitPiece(motion))]
+            self._take_size(character, data[_HEADER.size :], arrived_s)
+        elif (sample := self._joined(character, counter, part, data, items)) is not None:
+            motion = self._motion(character, sample.poses, time_ms / 1000, arrived_s)
+            wearer = self.wearer if number == 0 else f"{self.wearer or 'character'} {number}"
+            yield Packet(wearer, SUIT, self.name, time_ms / 1000, arrived_s, SuitPiece(motion))
 
-    def _joined(
-        self, character: _Character, counter: int, part: int, data: bytes, items: int, refuse: Callable[[str], None]
-    ) -> _Sample | None:
+    def _joined(self, character: _Character, counter: int, part: int, data: bytes, items: int) -> _Sample | None:
         """The sample that a datagram completes, if it does."""
-        if len(data) < _HEADER.size + items * _POSE.itemsize:
-            return refuse(TRUNCATED)
-        if counter == character.newest:
-            return refuse(REPEATED)
+        require(TRUNCATED if len(data) < _HEADER.size + items * _POSE.itemsize else None)
+        require(REPEATED if counter == character.newest else None)
         sample = character.samples.setdefault(counter, _Sample())
         poses = np.frombuffer(data, _POSE, items, _HEADER.size)
         body = poses[(poses["id"] >= 1) & (poses["id"] <= len(SEGMENTS))]
@@ -154,38 +142,29 @@ class MvnSource(DatagramSource):
         if sample.last is None or len(sample.parts) <= sample.last:
             if len(character.samples) > MAX_JOINED:
                 del character.samples[next(iter(character.samples))]
-                refuse(INCOMPLETE)
+                raise Fault(INCOMPLETE)
             return None
         del character.samples[counter]
-        if len(sample.seen) < len(SEGMENTS):
-            return refuse(INCOMPLETE)
+        require(INCOMPLETE if len(sample.seen) < len(SEGMENTS) else None)
         character.newest = counter
         return sample
 
-    def _motion(
-        self, character: _Character, poses: np.ndarray, time_s: float, arrived_s: float, refuse: Callable[[str], None]
-    ) -> Motion | None:
+    def _motion(self, character: _Character, poses: np.ndarray, time_s: float, arrived_s: float) -> Motion:
         """One frame of motion."""
         quat_wxyz = torch.from_numpy(poses["quat_wxyz"].astype(np.float32)).double()[self._order]
         t_world = torch.from_numpy(poses["position"].astype(np.float32)).double()[self._order]
-        if not (quat_wxyz.isfinite().all() and t_world.isfinite().all()):
-            return refuse(NOT_FINITE)
-        if not ((quat_wxyz.norm(dim=-1) - 1).abs() <= UNIT_TOLERANCE).all():
-            return refuse(NOT_A_ROTATION)
+        require(None if quat_wxyz.isfinite().all() and t_world.isfinite().all() else NOT_FINITE)
+        require(None if ((quat_wxyz.norm(dim=-1) - 1).abs() <= UNIT_TOLERANCE).all() else NOT_A_ROTATION)
         if self.up == "y":  # the segments' own axes are turned like the world's
             quat_wxyz = torch.cat([quat_wxyz[:, :1], quat_wxyz[:, 1:][:, _Y_UP]], -1)
             t_world = t_world[:, _Y_UP]
         R_world = matrix_from_quat_wxyz(quat_wxyz)
         offsets = bone_offsets(self._xsens23, R_world, t_world)
         metres = _metres(offsets)
-        if metres is None:
-            return refuse(OUT_OF_RANGE)
         t_root = t_world[0] * metres
-        if not (t_root.abs() <= MAX_POSITION_M).all():
-            return refuse(OUT_OF_RANGE)
+        require(None if (t_root.abs() <= MAX_POSITION_M).all() else OUT_OF_RANGE)
         if character.skeleton is None:
-            if arrived_s - character.first_s < SCALE_WAIT_S:
-                return refuse(NO_SIZE_YET)
+            require(NO_SIZE_YET if arrived_s - character.first_s < SCALE_WAIT_S else None)
             bones = offsets * metres if character.offsets_m is None else character.offsets_m
             skeleton = self._xsens23.with_offsets(bones.float())
             character.skeleton = replace(skeleton, sites=skeleton.sites | character.sites)
@@ -197,25 +176,19 @@ class MvnSource(DatagramSource):
             provenance={"source": "Xsens MVN", "format": "mvn"},
         )
 
-    def _take_size(
-        self, character: _Character, payload: bytes, arrived_s: float, refuse: Callable[[str], None]
-    ) -> None:
+    def _take_size(self, character: _Character, payload: bytes, arrived_s: float) -> None:
         """Bones or points of a character. A skeleton stays as it began unless another person's bones arrive."""
         try:
             origins, points = _size(payload)
-        except (struct.error, ValueError):
-            return refuse(TRUNCATED)
+        except (struct.error, ValueError) as error:
+            raise Fault(TRUNCATED) from error
         if origins:
-            if set(SEGMENTS) - set(origins):
-                return refuse(INCOMPLETE)
+            require(INCOMPLETE if set(SEGMENTS) - set(origins) else None)
             t = torch.tensor([origins[name] for name in self._xsens23.joint_names], dtype=torch.float64)
             spine = t[self._xsens23.index("head")] - t[0]
-            if not spine[2] > spine[:2].norm():
-                return refuse(NOT_UPRIGHT)
+            require(None if spine[2] > spine[:2].norm() else NOT_UPRIGHT)
             offsets = bone_offsets(self._xsens23, torch.eye(3, dtype=torch.float64).expand(len(t), 3, 3), t)
             metres = _metres(offsets)
-            if metres is None:
-                return refuse(OUT_OF_RANGE)
             offsets = offsets * metres
             known = character.skeleton.t_parent_joint[1:] if character.skeleton is not None else None
             if known is not None and (known - offsets[1:]).norm(dim=-1).max() > BONE_CHANGE_M:
@@ -225,13 +198,15 @@ class MvnSource(DatagramSource):
             if label in SITE_OF and 1 <= segment <= len(SEGMENTS) and max(map(abs, at)) * character.size_metres < 1.0:
                 place = tuple(character.size_metres * value for value in at)
                 character.sites[SITE_OF[label]] = Site(SEGMENTS[segment - 1], place)
-        return None
 
 
-def _metres(offsets: Float[Tensor, "joint 3"]) -> float | None:
-    """Metres per unit of a person's bones, which are given in metres or centimetres; None for nobody's bones."""
+def _metres(offsets: Float[Tensor, "joint 3"]) -> float:
+    """Metres per unit of a person's bones, which are given in metres or centimetres. Raises Fault for nobody's bones."""
     total = offsets[1:].norm(dim=-1).sum().item()
-    return next((metres for metres in (1.0, 0.01) if _BONES_M[0] < total * metres < _BONES_M[1]), None)
+    for metres in (1.0, 0.01):
+        if _BONES_M[0] < total * metres < _BONES_M[1]:
+            return metres
+    raise Fault(OUT_OF_RANGE)
 
 
 def _size(payload: bytes) -> tuple[dict[str, tuple[float, ...]], list[tuple[int, str, tuple[float, ...]]]]:

@@ -10,7 +10,7 @@ import torch
 from pythonosc.osc_message import OscMessage, ParseError
 
 from wearcap.apps.live.packets import HEAD, Packet
-from wearcap.apps.live.source import Address, DatagramSource
+from wearcap.apps.live.source import Address, DatagramSource, Fault, counted, require
 from wearcap.apps.live.sources.parts import UNTRACKED, Names, checked_pose, device_of, pose_of, untracked
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis
@@ -90,11 +90,11 @@ def _message(
     return Message(message.address, message.params)
 
 
-def _floats(arguments: list[Any], count: int) -> list[float] | None:
-    """The first numbers of the arguments; more of them are for later versions of a protocol."""
+def _floats(arguments: list[Any], count: int) -> list[float]:
+    """The first numbers of the arguments; more of them are for later versions of a protocol. Raises Fault for others."""
     values = arguments[:count]
     if len(values) < count or not all(isinstance(value, float | int) for value in values):
-        return None
+        raise Fault(WRONG_ARGUMENTS)
     return [float(value) for value in values]
 
 
@@ -103,6 +103,23 @@ _VMC_DEVICES = (_VMC_HEAD, "/VMC/Ext/Con/Pos", "/VMC/Ext/Tra/Pos")
 _LOCAL = "/Local"
 _WITHOUT_GLOBAL_S = 0.5
 """Poses in the tracking space stand for missing ones in the world after so long."""
+
+
+@dataclass
+class _Tracker:
+    """State of one device of the protocol."""
+
+    global_s: float | None = None
+    """When its pose in the world was last seen, or its first in the tracking space."""
+    sent_s: float | None = None
+    """The sender's time (s) of its newest packet that has one."""
+
+    def wanted(self, local: bool, now_s: float) -> bool:
+        """Whether to use a pose: one in the tracking space only where the device has none in the world."""
+        if not local or self.global_s is None:
+            self.global_s = now_s
+            return not local
+        return now_s - self.global_s > _WITHOUT_GLOBAL_S
 
 
 class VmcSource(DatagramSource):
@@ -118,71 +135,46 @@ class VmcSource(DatagramSource):
 
     def __init__(self, address: Address):
         super().__init__(address)
-        address.require_options()
-        self._names = Names()
+        self._head, self._trackers = _Tracker(), Names(lambda _: _Tracker())
         self._time_s: float | None = None
-        self._global_s: dict[str, float] = {}
-        """When a device's pose in the world was last seen, or its first in the tracking space."""
-        self._sent_s: dict[str, float | None] = {}
 
-    def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
+    def packets(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[Packet]:
         here_s: float | None = None
-        poses: dict[str, tuple[Rigid | None, float | None]] = {}
+        poses: dict[str, tuple[_Tracker, Rigid | None, float | None]] = {}
         for address, arguments in osc_messages(data, self.known, refuse):
-            if address == _VMC_TIME:
-                here_s = self._time(arguments, refuse)
-            elif found := self._pose(address, arguments, arrived_s, refuse):
-                name, pose = found
-                poses[name] = (pose, self._time_s)
-        packets = []
-        for name, (pose, sent_s) in poses.items():
+            with counted(refuse):
+                if address == _VMC_TIME:
+                    here_s = self._time(arguments)
+                elif found := self._pose(address, arguments, arrived_s, refuse):
+                    device, tracker, pose = found
+                    poses[device] = (tracker, pose, self._time_s)
+        for device, (tracker, pose, time_s) in poses.items():
             # A time in the datagram counts for all of it; an earlier one stands for one pose of each device.
-            sent_s = here_s if here_s is not None else None if sent_s == self._sent_s.get(name) else sent_s
-            self._sent_s[name] = sent_s if sent_s is not None else self._sent_s.get(name)
-            packets.append(_packet(self, name, sent_s, arrived_s, pose))
-        return packets
+            sent_s = here_s if here_s is not None else None if time_s == tracker.sent_s else time_s
+            tracker.sent_s = tracker.sent_s if sent_s is None else sent_s
+            yield _packet(self, device, sent_s, arrived_s, pose)
 
-    def _time(self, arguments: list[Any], refuse: Callable[[str], None]) -> float | None:
-        values = _floats(arguments, 1)
-        if values is None:
-            return refuse(WRONG_ARGUMENTS)
-        if fault := time_fault(values[0]):
-            return refuse(fault)
-        self._time_s = values[0]
-        return values[0]
+    def _time(self, arguments: list[Any]) -> float:
+        (time_s,) = _floats(arguments, 1)
+        require(time_fault(time_s))
+        self._time_s = time_s
+        return time_s
 
     def _pose(
         self, address: str, arguments: list[Any], arrived_s: float, refuse: Callable[[str], None]
-    ) -> tuple[str, Rigid | None] | None:
+    ) -> tuple[str, _Tracker, Rigid | None] | None:
         values = _floats(arguments[1:], 7)
-        if values is None:
-            return refuse(WRONG_ARGUMENTS)
-        head = address.startswith(_VMC_HEAD)
-        if not head and (fault := self._names.fault(arguments[0], arrived_s)):
-            return refuse(fault)
-        device = HEAD if head else device_of(arguments[0])
-        if not self._wanted(device, address.endswith(_LOCAL), arrived_s):
+        if address.startswith(_VMC_HEAD):
+            tracker, device = self._head, HEAD
+        else:
+            tracker, device = self._trackers.entry(arguments[0], arrived_s), device_of(arguments[0])
+        if not tracker.wanted(address.endswith(_LOCAL), arrived_s):
             return None
         quat_wxyz = [values[6], *values[3:6]]
         if untracked(values[:3], quat_wxyz):
             refuse(UNTRACKED)
-            return (HEAD, None) if head else None
-        pose = pose_of(values[:3], quat_wxyz, "unity")
-        if isinstance(pose, str):
-            return refuse(pose)
-        return device, pose
-
-    def _wanted(self, device: str, local: bool, now_s: float) -> bool:
-        """Whether to use a pose: one in the tracking space only where the device has none in the world."""
-        if len(self._global_s) > 2 * self._names.limit:  # of devices that are long forgotten, too
-            self._global_s.clear()
-            self._sent_s.clear()
-        if not local:
-            self._global_s[device] = now_s
-        elif device not in self._global_s:
-            self._global_s[device] = now_s
-            return False
-        return not local or now_s - self._global_s[device] > _WITHOUT_GLOBAL_S
+            return (HEAD, tracker, None) if device == HEAD else None
+        return device, tracker, pose_of(values[:3], quat_wxyz, "unity")
 
 
 def _packet(source: DatagramSource, device: str, sent_s: float | None, arrived_s: float, pose: Rigid | None) -> Packet:
@@ -225,18 +217,14 @@ class OscTrackerSource(DatagramSource):
 
     def __init__(self, address: Address):
         super().__init__(address)
-        address.require_options()
         self._halves = {tracker: _Halves() for tracker in _TRACKERS}
 
-    def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
+    def packets(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[Packet | None]:
         touched: dict[str, None] = {}
         for address, arguments in osc_messages(data, self.known, refuse):
-            values = _floats(arguments, 3)
-            if values is None:
-                refuse(WRONG_ARGUMENTS)
-            elif not all(map(math.isfinite, values)):
-                refuse(NOT_FINITE)
-            else:
+            with counted(refuse):
+                values = _floats(arguments, 3)
+                require(None if all(map(math.isfinite, values)) else NOT_FINITE)
                 tracker, half = address.split("/")[3:]
                 halves = self._halves[tracker]
                 setattr(halves, half, values)
@@ -244,10 +232,11 @@ class OscTrackerSource(DatagramSource):
                 halves.fresh |= {half}
                 halves.paired_s = arrived_s if halves.paired_s is None else halves.paired_s
                 touched[tracker] = None
-        packets = (self._paired(tracker, arrived_s, refuse) for tracker in touched)
-        return [packet for packet in packets if packet is not None]
+        for tracker in touched:
+            with counted(refuse):
+                yield self._paired(tracker, arrived_s)
 
-    def _paired(self, tracker: str, arrived_s: float, refuse: Callable[[str], None]) -> Packet | None:
+    def _paired(self, tracker: str, arrived_s: float) -> Packet | None:
         halves = self._halves[tracker]
         if halves.position is None or halves.rotation is None or halves.paired_s is None:
             return None
@@ -256,12 +245,9 @@ class OscTrackerSource(DatagramSource):
         if not together and not (arrived_s - halves.paired_s > UNPAIRED_S and apart_s <= NEWEST_S):
             return None
         halves.fresh, halves.paired_s = frozenset(), arrived_s
-        if max(map(abs, halves.rotation)) > MAX_ANGLE_DEG:
-            return refuse(OUT_OF_RANGE)
+        require(OUT_OF_RANGE if max(map(abs, halves.rotation)) > MAX_ANGLE_DEG else None)
         x, y, z = torch.tensor(halves.rotation).deg2rad()
         # Unity turns about z, then x, then y, each about the world's axis.
         R = about_axis("y", y) @ about_axis("x", x) @ about_axis("z", z)
         pose = checked_pose(halves.position, R, "unity")
-        if isinstance(pose, str):
-            return refuse(pose)
         return _packet(self, HEAD if tracker == HEAD else f"tracker{tracker}", None, arrived_s, pose)

@@ -2,13 +2,16 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.apps.live.packets import CAMERA, HEAD, SUIT
+from wearcap.apps.live.recent import Entry, Recent
+from wearcap.apps.live.source import Fault, require
 from wearcap.body.skeleton import WRISTS
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.headset_axes import CONVENTIONS
@@ -18,8 +21,6 @@ MAX_NAME = 64
 """Characters of a device's or wearer's name."""
 MAX_NAMES = 64
 """Names that a source knows at once."""
-FORGOTTEN_S = 60.0
-"""A name that was silent for so long makes room for another."""
 UNIT_TOLERANCE = 0.02
 """Tolerance of a quaternion's length."""
 AXES = {"wearcap": torch.eye(3), **CONVENTIONS}
@@ -31,27 +32,19 @@ TOO_MANY_NAMES = "too many devices"
 BAD_NAME = "no name"
 
 
-class Names:
-    """Names that come from the network, bounded in number and length; a name that has been silent is forgotten."""
+class Names(Recent[Entry]):
+    """What a source keeps by names that come from the network, bounded in number and length."""
 
-    def __init__(self, limit: int = MAX_NAMES):
-        self.limit = limit
-        self._last_s: dict[str, float] = {}
+    def __init__(self, make: Callable[[str], Entry] = lambda name: None):
+        super().__init__(MAX_NAMES, make)
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._last_s
-
-    def fault(self, name: object, now_s: float) -> str | None:
-        """Why a name cannot be used, or None."""
+    def entry(self, name: Any, now_s: float) -> Entry:
+        """What is kept by a name. Raises Fault for a name that cannot be used."""
         if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or not name.isprintable():
-            return BAD_NAME
-        if name not in self._last_s and len(self._last_s) >= self.limit:
-            oldest = min(self._last_s, key=self._last_s.__getitem__)
-            if now_s - self._last_s[oldest] < FORGOTTEN_S:
-                return TOO_MANY_NAMES
-            del self._last_s[oldest]
-        self._last_s[name] = now_s
-        return None
+            raise Fault(BAD_NAME)
+        self.admit(name, now_s)
+        require(None if name in self else TOO_MANY_NAMES)
+        return self[name]
 
 
 def device_of(serial: str) -> str:
@@ -68,20 +61,17 @@ def device_of(serial: str) -> str:
     return WRISTS[0] if left else WRISTS[1]
 
 
-def pose_of(position: Sequence[float], quat_wxyz: Sequence[float], axes: str) -> Rigid | str:
-    """A pose of named axes, world and device alike, in wearcap's; or why there is none."""
-    R = matrix_of(quat_wxyz)
-    return R if isinstance(R, str) else checked_pose(position, R, axes)
+def pose_of(position: Sequence[float], quat_wxyz: Sequence[float], axes: str) -> Rigid:
+    """A pose of named axes, world and device alike, in wearcap's. Raises Fault for one that is none."""
+    return checked_pose(position, matrix_of(quat_wxyz), axes)
 
 
-def matrix_of(quat_wxyz: Sequence[float]) -> Float[Tensor, "3 3"] | str:
-    """Rotation matrix of a quaternion of about unit length; or why there is none."""
+def matrix_of(quat_wxyz: Sequence[float]) -> Float[Tensor, "3 3"]:
+    """Rotation matrix of a quaternion of about unit length. Raises Fault for another one."""
     w, x, y, z = quat_wxyz
     square = w * w + x * x + y * y + z * z
-    if not math.isfinite(square):
-        return NOT_FINITE
-    if abs(square - 1) > 2 * UNIT_TOLERANCE:
-        return NOT_A_ROTATION
+    if not abs(square - 1) <= 2 * UNIT_TOLERANCE:
+        raise Fault(NOT_A_ROTATION if math.isfinite(square) else NOT_FINITE)
     s = 2 / square
     rows = [
         [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
@@ -91,15 +81,12 @@ def matrix_of(quat_wxyz: Sequence[float]) -> Float[Tensor, "3 3"] | str:
     return torch.tensor(rows)
 
 
-def checked_pose(position: Sequence[float], R: Float[Tensor, "3 3"], axes: str) -> Rigid | str:
+def checked_pose(position: Sequence[float], R: Float[Tensor, "3 3"], axes: str) -> Rigid:
     """As `pose_of`, of a matrix."""
     t = torch.tensor(position, dtype=torch.float32)
-    if fault := rotation_fault(R) or values_fault(t, (3,), MAX_POSITION_M):
-        return fault
-    if axes == "wearcap":
-        return Rigid(R, t)
+    require(rotation_fault(R) or values_fault(t, (3,), MAX_POSITION_M))
     M = AXES[axes]
-    return Rigid(M @ R @ M.T, M @ t)
+    return Rigid(R, t) if axes == "wearcap" else Rigid(M @ R @ M.T, M @ t)
 
 
 def untracked(position: Sequence[float], quat_wxyz: Sequence[float]) -> bool:

@@ -5,20 +5,25 @@ direction are found in the first second of a device's samples, as `io.devices.wa
 Sensor Logger sends a phone's sensors as entries of their own, which are paired by time; a watch's come together.
 """
 
+import asyncio
 import math
+import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from wearcap.apps.live.packets import Inbox, Packet
-from wearcap.apps.live.source import Address, DatagramSource
+from wearcap.apps.live.source import Address, DatagramSource, Fault, counted, require
 from wearcap.apps.live.sources.parts import Names, device_of, matrix_of
-from wearcap.apps.live.sources.posts import serve_posts
+from wearcap.apps.web.connections import DELIVERING, SPOKEN
+from wearcap.apps.web.guard import Guard
+from wearcap.apps.web.http_server import Answer, Handler, HttpServer
 from wearcap.body.skeleton import WRISTS
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError, require_choice
@@ -28,7 +33,7 @@ from wearcap.sensors.samples import WatchSample
 
 MAX_ENTRIES = 4096
 """Samples or sensors' entries of one message."""
-MAX_COLUMNS = 256
+MAX_COLUMNS, MAX_BODY = 256, 1 << 20
 FIRST_S, FIRST_ROWS, MAX_ROWS = 1.0, 10, 512
 """Length of what a convention is found in (s), and its least and largest number of samples."""
 PAIR_S = 0.02
@@ -107,13 +112,14 @@ class _Watch:
     whole: bool = False
     """Whether it sends whole samples, so that entries of single sensors are another device's, the phone's."""
 
-    def understood(self, row: _Row, refuse: Callable[[str], None]) -> WatchConvention | None:
+    def understood(self, row: _Row) -> WatchConvention | None:
         """The convention, once it is found; until then the sample is kept for that."""
         if self.convention is not None:
             length = math.hypot(*row.gravity) * abs(self.convention.m_s2)
             self.changed = 0 if G_M_S2 / OTHER_UNIT < length < G_M_S2 * OTHER_UNIT else self.changed + 1
             if self.changed < CHANGED_ROWS:
-                return self.convention if self.changed == 0 else refuse(NO_CONVENTION)
+                require(NO_CONVENTION if self.changed else None)
+                return self.convention
             self.convention, self.changed, self.rows = None, 0, []
         step_s = row.time_s - self.rows[-1].time_s if self.rows else 0.01
         if not 0 < step_s <= FIRST_S:  # late, repeated, or of another time
@@ -129,8 +135,8 @@ class _Watch:
         try:
             gravity, quat_wxyz = (np.array([getattr(each, name) for each in rows]) for name in ("gravity", "quat_wxyz"))
             self.convention = watch_convention(gravity, quat_wxyz, "watch")
-        except WearcapError:
-            refuse(NO_CONVENTION)
+        except WearcapError as error:
+            raise Fault(NO_CONVENTION) from error
         return self.convention
 
 
@@ -140,37 +146,21 @@ class WatchSource(DatagramSource):
     scheme, port, hz = "watch", 5555, 100.0
     convention = "SensorLog's CSV or JSON, Sensor Logger's JSON; g or m/s², either sign: found in the first second"
 
+    own_options = ("joint",)
+
     def __init__(self, address: Address):
         super().__init__(address)
-        address.require_options("joint", *self.own_options)
         self.joint = address.options.get("joint")
         if self.joint is not None:
             require_choice(self.joint, WRISTS, f"joint={self.joint}")
-        self._names = Names()
-        self._watches: dict[str, _Watch] = {}
+        self._watches = Names(lambda _: _Watch())
         self._columns: list[str] = []
 
-    own_options: tuple[str, ...] = ()
-
-    def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
-        packets: list[Packet] = []
-        if data.lstrip()[:1] in (b"{", b"["):
-            found = self._json_rows(data, arrived_s, refuse)
-        else:
-            found = self._csv_rows(data, refuse)
-        for name, row in found:
+    def packets(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[Packet | None]:
+        json = data.lstrip()[:1] in (b"{", b"[")
+        for name, row in self._json_rows(data, arrived_s, refuse) if json else self._csv_rows(data, refuse):
             with _refusing(refuse):
-                if packet := self._packet(name, row, arrived_s, refuse):
-                    packets.append(packet)
-        return packets
-
-    def _watch(self, name: object, arrived_s: float, refuse: Callable[[str], None]) -> _Watch | None:
-        """State of a device by its name; None for a name that cannot be used."""
-        if fault := self._names.fault(name, arrived_s):
-            return refuse(fault)
-        if len(self._watches) > 2 * self._names.limit:
-            self._watches = {each: watch for each, watch in self._watches.items() if each in self._names}
-        return self._watches.setdefault(str(name), _Watch())
+                yield self._packet(name, row, arrived_s)
 
     def _json_rows(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[tuple[str, _Row]]:
         """Samples by device: of Sensor Logger's message, or of SensorLog's objects, one or a list, or one a line."""
@@ -181,7 +171,8 @@ class WatchSource(DatagramSource):
                 refuse(NO_SAMPLE)
                 continue
             if isinstance(content, dict) and isinstance(content.get("payload"), list):
-                yield from self._sensor_logger(content, arrived_s, refuse)
+                with counted(refuse):
+                    yield from self._sensor_logger(content, arrived_s, refuse)
                 continue
             for entry in content[:MAX_ENTRIES] if isinstance(content, list) else [content]:
                 with _refusing(refuse):
@@ -192,10 +183,7 @@ class WatchSource(DatagramSource):
         self, content: dict[str, Any], arrived_s: float, refuse: Callable[[str], None]
     ) -> Iterator[tuple[str, _Row]]:
         name = content.get("deviceId") or "watch"
-        watch = self._watch(name, arrived_s, refuse)
-        if watch is None:
-            return
-        entries = []
+        watch, entries = self._watches.entry(name, arrived_s), []
         for entry in content["payload"][:MAX_ENTRIES]:
             with _refusing(refuse):
                 sensor = entry["name"].lower().replace(" ", "").replace("_", "")
@@ -229,26 +217,19 @@ class WatchSource(DatagramSource):
                     yield values.get("deviceID") or values.get("deviceName") or "watch", _sensor_log(values.get)
         return None
 
-    def _packet(self, name: str, row: _Row, arrived_s: float, refuse: Callable[[str], None]) -> Packet | None:
+    def _packet(self, name: str, row: _Row, arrived_s: float) -> Packet | None:
         """A device's sample in wearcap's terms."""
-        watch = self._watch(name, arrived_s, refuse)
-        if watch is None:
-            return None
-        if fault := time_fault(row.time_s):
-            return refuse(fault)
-        R = matrix_of(row.quat_wxyz)
-        if isinstance(R, str):
-            return refuse(R)
-        felt = (*row.gravity, *row.free)
+        watch = self._watches.entry(name, arrived_s)
+        require(time_fault(row.time_s))
+        R, felt = matrix_of(row.quat_wxyz), (*row.gravity, *row.free)
         if not all(abs(value) <= MAX_ACC_M_S2 for value in felt):
-            return refuse(OUT_OF_RANGE if all(map(math.isfinite, felt)) else NOT_FINITE)
-        convention = watch.understood(row, refuse)
+            raise Fault(OUT_OF_RANGE if all(map(math.isfinite, felt)) else NOT_FINITE)
+        convention = watch.understood(row)
         if convention is None:
             return None
         R = R.T.contiguous() if convention.back else R
         acc_world = R @ (convention.m_s2 * torch.tensor(row.free))
-        if fault := values_fault(acc_world, (3,), MAX_ACC_M_S2):
-            return refuse(fault)
+        require(values_fault(acc_world, (3,), MAX_ACC_M_S2))
         device = self.joint or device_of(name)
         sample = WatchSample(row.time_s, R, acc_world, device)
         return Packet(self.wearer, device, f"{self.name}/{name}", row.time_s, arrived_s, sample)
@@ -258,10 +239,57 @@ class WatchHttpSource(WatchSource):
     """The same over HTTP: each POST is a message. `token=…` in the address must then be in the app's, too."""
 
     scheme, port = "watch+http", 8000
-    own_options = ("token",)
+    own_options = ("joint", "token")
 
-    async def run(self, inbox: Inbox) -> None:
-        await serve_posts(self, self.address.options.get("token"), inbox)
+    async def listen(self, inbox: Inbox) -> Callable[[], Awaitable[None]]:
+        server = _Posts(self, Guard.of(self.address.host, self.address.options.get("token")), inbox)
+        return lambda: asyncio.to_thread(server.stop)
+
+
+class _Posts(HttpServer):
+    """Gives a source what is posted, one message at a time."""
+
+    def __init__(self, source: DatagramSource, guard: Guard, inbox: Inbox):
+        self.source, self.inbox, self.lock = source, inbox, threading.Lock()
+        super().__init__(source.address.host, source.address.port, _Post, guard)
+
+    def refuse(self, why: str) -> None:
+        self.inbox.refuse(self.source.name, why)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        self.refuse("broken connection")
+
+
+class _Post(Handler):
+    server: _Posts  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def do_POST(self) -> None:
+        self.answer(self._take)
+
+    def do_GET(self) -> None:
+        self.answer(self._refuse)
+
+    do_HEAD = do_PUT = do_DELETE = do_OPTIONS = do_GET
+
+    def _refuse(self) -> None:
+        raise Answer(HTTPStatus.METHOD_NOT_ALLOWED, "a sensor app's messages are POSTed here")
+
+    def _take(self) -> None:
+        source, body = self.server.source, self.body(MAX_BODY)
+        self.place.rise(SPOKEN)
+        with self.server.lock:
+            if not source.budget.allows(len(body), self.place):
+                raise Answer(HTTPStatus.TOO_MANY_REQUESTS)
+            if source.understand(body, self.server.inbox, self.place):
+                self.place.rise(DELIVERING)
+        self.send(b"")
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        self.server.refuse(HTTPStatus(code).phrase.lower())
+        super().send_error(code, message, explain)
+
+    def log_error(self, format: str, *args: Any) -> None:
+        self.server.refuse("broken connection")
 
 
 _VALUES: Mapping[str, tuple[str, ...]] = {
@@ -281,7 +309,8 @@ _VALUES: Mapping[str, tuple[str, ...]] = {
 def _refusing(refuse: Callable[[str], None]) -> Iterator[None]:
     """What is no sample is counted, and the next one looked at."""
     try:
-        yield
+        with counted(refuse):
+            yield
     except (WearcapError, ValueError, TypeError, LookupError, OverflowError, AttributeError):
         refuse(NO_SAMPLE)
 
