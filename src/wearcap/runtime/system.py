@@ -246,11 +246,15 @@ class LearnedSystem(System):
         motions = self.motions([once[id(recording)] for recording in recordings], seeds)
         notes = [motion.provenance.get("note") for motion in motions]
         found = [Captured(motion, {"notes": [note]} if note else None) for motion, note in zip(motions, notes)]
-        return (
-            found
-            if self.refine is None
-            else [_refined(self.refine, each, once[id(recording)]) for each, recording in zip(found, recordings)]
-        )
+        if self.refine is None:
+            return found
+        return [_refined(self.refine, each, once[id(recording)]) for each, recording in zip(found, recordings)]
+
+    def session_class(self) -> Any:
+        """As of `System`. Raises WearcapError with a refinement, too, which needs the whole recording."""
+        if self.refine is not None:
+            raise WearcapError("a stream with refine=…, which needs whole recordings", fix="Leave refine=… out.")
+        return super().session_class()
 
 
 def _refined(refine: Refine, captured: Captured, source: CaptureInput) -> Captured:
