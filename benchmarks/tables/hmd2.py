@@ -114,7 +114,7 @@ WINDOW = {
     "avatarposer_hands": 82,
 }
 """Frames of a window that a network sees, where they are not 240: AvatarPoser's two pairs of poses see 41 each."""
-ALONE = "head alone"
+ALONE, BY_HPS = "head alone", "refine=hps"
 PEOPLE = (*BASELINES, *TRAINED, ALONE)
 """Rows of the tables of people without surroundings, beside those of other sensors."""
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
@@ -230,6 +230,7 @@ def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
         *(replace(alone, name=f"{ALONE}, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors),
     ]
     ours.append(replace(alone, name=f"{ALONE}, as predicted", pipeline=(*alone.pipeline, "pipeline.refinement=null")))
+    ours.append(replace(alone, name=f"{ALONE}, {BY_HPS}", pipeline=(*alone.pipeline, BY_HPS)))
     ours += [replace(alone, name=f"{ALONE}, {what}", height_off_m=off) for what, off in WRONG_HEIGHTS.items()]
     ours.append(replace(alone, name=f"{ALONE}, exact sensors, bones given", sensors=GIVEN))
     ours = [method for method in ours if options.rows is None or method.name in options.rows]
@@ -352,6 +353,7 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
         *separate,
         _ours(options, "full, the paper's windows", pipeline="paper/hmd2"),
         _ours(options, "full, sampled in five steps", pipeline="ablation/hmd2_sampled"),
+        _ours(options, f"full, {BY_HPS}", BY_HPS),
     ]
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
     for method in wanted:

@@ -78,17 +78,21 @@ def test_planted_feet_come_to_the_floor_and_the_head_to_where_it_was_measured(gr
 
 
 def test_sliding_feet_are_held(refine):
-    """Both hips swing to and fro more than once a second, and the feet that should stand with them."""
+    """Both hips swing to and fro more than once a second, and with them the feet, which stay level."""
     recording, motion = walk_above_its_floor()
     R, skeleton = motion.R_parent_joint.clone(), motion.skeleton
     swing = rotation.about_axis("y", 0.05 * torch.sin(8.0 * motion.timestamps.float()))
-    for joint in skeleton.indices("left_hip", "right_hip"):
-        R[:, joint] = swing @ R[:, joint]
+    for hip, knee, ankle in (
+        skeleton.indices(f"{side}_hip", f"{side}_knee", f"{side}_ankle") for side in ("left", "right")
+    ):
+        before, R[:, hip] = R[:, hip] @ R[:, knee], swing @ R[:, hip]
+        R[:, ankle] = (R[:, hip] @ R[:, knee]).mT @ before @ R[:, ankle]
     sliding = replace(motion, R_parent_joint=R)
     level = replace(recording, points=PointCloud(recording.points.points_world - torch.tensor([0.0, 0.0, RAISED_M])))
     refined = refine(sliding, CaptureInput(level)).motion
-    assert slid_m_s(sliding, recording) > 0.1
-    assert slid_m_s(refined, recording) < 0.03
+    before, after, least = (slid_m_s(each, recording) for each in (sliding, refined, recording.motion))
+    assert before > 2 * least, "legs of the planted walk are too short for its longest steps"
+    assert after < 1.05 * least
 
 
 def slid_m_s(motion: Motion, recording: Recording) -> float:
@@ -137,6 +141,4 @@ def test_gaps_of_the_head_s_path_hold_nothing():
         motion.skeleton,
         60.0,
     )
-    valid = initialized(motion, path).valid
-    inside = (motion.timestamps > 1.0) & (motion.timestamps < 2.0)
-    assert torch.equal(valid, ~inside)
+    assert torch.equal(initialized(motion, path).valid, kept)
