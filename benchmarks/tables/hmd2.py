@@ -115,6 +115,8 @@ WINDOW = {
 }
 """Frames of a window that a network sees, where they are not 240: AvatarPoser's two pairs of poses see 41 each."""
 ALONE, BY_HPS = "head alone", "refine=hps"
+REFINED = "refined by HPS"
+"""Name of the tables (`--keep`) in which that row stands beside the one without."""
 PEOPLE = (*BASELINES, *TRAINED, ALONE)
 """Rows of the tables of people without surroundings, beside those of other sensors."""
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
@@ -437,7 +439,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         simulated="People, flats, points and pictures of the simulated wearers; on CMU the motion is real, and surroundings, points "
         "and pictures are simulated. The head's path has the jitter of [simulation](simulation.md). Rows without other words have "
         "typical sensors.",
-        limits=_limits(simulated, real, strangers),
+        limits=(*_limits(simulated, real, strangers), *_refined(people)),
         full=[*score_grids(people, _labels(), "repetitions"), *_grids(trees)],
         commands=found,
         measured=_measured(simulated, real),
@@ -507,6 +509,26 @@ def _limits(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[s
         f"The paper reports {paper[0]:.2f} cm and an FID of {paper[fid]:.2f} on its own real recordings (Nymeria): no comparison. FID needs more windows than "
         "CMU's held-out subjects have. FIDs here are in the space of the motion autoencoder before 2026-11-28.",
         "No recording of a real head-mounted device has been scored.",
+    )
+
+
+def _refined(people: Tree) -> tuple[str, ...]:
+    """What refining by HPS's energy brings, of the tables that were made for it."""
+    parts = []
+    for data, whom in (("hdm05", "HDM05's person"), ("cmu", "CMU")):
+        start = f"{REFINED}, People ({data})"
+        rows = next((rows for title, rows in people["tables"].items() if title.startswith(start)), None)
+        if rows is None:
+            return ()
+        before, after = rows[ALONE], rows[f"{ALONE}, {BY_HPS}"]
+        slid, joints = (
+            f"{mean(before[metric], digits)} → {mean(after[metric], digits)}"
+            for metric, digits in (("foot_skate_cm_s", 1), ("mpjpe_cm", 2))
+        )
+        parts.append(f"on {whom} {slid} cm/s (joints {joints} cm)")
+    return (
+        f"`{BY_HPS}` (HPS's energy over the capture, head alone, repaired hips) lets standing feet slide less, {' and '.join(parts)}; it takes "
+        "longer than the capture itself, a stream cannot have it, and it is off unless wished.",
     )
 
 

@@ -64,11 +64,11 @@ def test_planted_feet_come_to_the_floor_and_the_head_to_where_it_was_measured(gr
         source = CaptureInput(replace(recording, points=None), scan=Scan(level.float().numpy()))
     captured = refine(motion, source)
     refined, true = captured.motion, recording.motion
-    assert standing(true, recording).mean() < 0.02, "without refinement soles are deep in the floor"
+    assert standing(true, recording).mean() < RAISED_M - 0.04, "without refinement soles are deep in the floor"
     skin_m = (
         0.0 if ground == "points" else 0.007
     )  # on a scan stands the skin, whose soles are rounder than the skeleton's
-    assert (standing(refined, recording) - RAISED_M + skin_m).abs().mean() < 0.012
+    assert (standing(refined, recording) - RAISED_M + skin_m).abs().mean() < 0.02
     head, measured = refined.joint("head"), true.joint("head")
     assert (motion.joint("head").t - measured.t).norm(dim=-1).min() > 0.3
     assert (head.t - measured.t).norm(dim=-1).mean() < 0.015
@@ -116,6 +116,17 @@ def test_without_refinement_a_capture_is_what_the_network_predicts():
     assert captured.report == {"notes": ["planted"], "stopped": "here"}
     with pytest.raises(WearcapError, match="a stream with refine=…"):
         refined.stream()
+
+
+def test_a_floor_that_only_the_head_tells_pulls_less(refine):
+    """The walker stoops by centimetres: from the head alone the floor seems lower than it is."""
+    recording, motion = walk_above_its_floor(4.0)
+    unseen = replace(recording, points=None)
+    moved = [
+        (standing(replace(refine, head_floor=share)(motion, CaptureInput(unseen)).motion, recording)).mean().item()
+        for share in (0.0, refine.head_floor, 1.0)
+    ]
+    assert moved[0] > moved[1] > moved[2]
 
 
 def test_captures_are_not_refined_unless_it_is_wished():

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FEET, FOOT_PATCHES
-from wearcap.recording import Motion, Recording
+from wearcap.recording import Motion
 from wearcap.recording.recording import Localization
 from wearcap.runtime.system import Captured, CaptureInput
 from wearcap.sensors.initialization import Initialization
@@ -29,6 +29,8 @@ class HpsRefinement:
     energy: HpsEnergy
     solver: Solver
     evidence: Evidence
+    head_floor: float
+    """Share of the ground's weight that a floor has which the head's path alone tells."""
     lifted_m: float
     """Height (m) above its foot's lower patch at which a patch does not stand: networks predict contact of whole feet."""
 
@@ -37,18 +39,27 @@ class HpsRefinement:
 
         Raises WearcapError for a recording without head poses, or with a scan that cannot be read.
         """
-        recording, hps = source.recording, HPS(self.energy, self.solver, evidence=self.evidence)
+        recording, scan = source.recording, source.read_scan()
         path = head_path(recording, motion.skeleton, motion.fps)
-        start, scan = initialized(motion, path), source.read_scan()
+        seen = floor_from_points(recording.points, path.T_world_head.t, path.stature)
+        energy = self.energy if scan or seen is not None else self.doubting_floor
+        hps, start = HPS(energy, self.solver, evidence=self.evidence), initialized(motion, path)
         head = Localization(path.timestamps, path.T_world_head.R, path.T_world_head.t, start.valid.float())
         suit = replace(motion, contact_prob=self.contact_prob(motion))
         data = hps.problem(replace(recording, localization=head), suit, start, scan, torch.eye(3).double())
         if scan is None:
-            data = replace(data, floor_height=(floor_below(recording, path) + sole_height(data.patches)).double())
+            floor = path.floor_height if seen is None else seen
+            data = replace(data, floor_height=(floor + sole_height(data.patches)).double())
         solution = hps.optimize(data)
         provenance = motion.provenance | {"refine": "hps", "solver": solution.reason}
         refined = replace(hps.motion(start, solution), provenance=provenance)
         return Captured(refined, {"stopped": solution.reason, "energy": solution.history})
+
+    @property
+    def doubting_floor(self) -> HpsEnergy:
+        """The energy above a floor that the head's path alone tells."""
+        weights = {name: self.head_floor * self.energy.weight(name) for name in self.energy.reading("on_ground")}
+        return replace(self.energy, weights=self.energy.weights | weights)
 
     def contact_prob(self, motion: Motion) -> Float[Tensor, "time patch"] | None:
         """Predicted contacts without lifted patches; None where none are predicted: they follow from the feet's speed."""
@@ -66,12 +77,6 @@ def initialized(motion: Motion, path: HeadPath) -> Initialization:
     for begin, stop in path.stretches:
         valid[begin:stop] = True
     return Initialization(moved, valid, torch.zeros(len(motion)), moved.t_world_root.diff(dim=0))
-
-
-def floor_below(recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
-    """Height (m) of the floor below the head: of the recording's points, else from the head's path alone."""
-    floor = floor_from_points(recording.points, path.T_world_head.t, path.stature)
-    return path.floor_height if floor is None else floor
 
 
 def sole_height(patches: FootPatches) -> float:
