@@ -1,7 +1,9 @@
 """HMD² with points and images end to end: every experiment of it trains, and one checkpoint captures with any of them."""
 
+import csv
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -161,6 +163,31 @@ def test_a_capture_reports_its_conditions(checkpoint, data, tmp_path):
     assert torch.equal(read_motion(tmp_path / "motion.npz").R_parent_joint, first.R_parent_joint)
     assert not torch.allclose(second.R_parent_joint, first.R_parent_joint), "another draw"
     assert (tmp_path / "samples.png").stat().st_size > 10_000
+
+
+def test_a_capture_is_refined_by_hps(checkpoint, data, tmp_path):
+    found = {}
+    for refine in ("none", "hps"):
+        folder = tmp_path / refine
+        given = [f"checkpoint={checkpoint}", f"recording={data}/r3", f"hydra.run.dir={folder}", f"refine={refine}"]
+        capture.main([*given, "video=false", "body=false", "smpl=false"])
+        found[refine] = read_motion(folder / "motion.npz")
+    energy = json.loads((tmp_path / "hps" / "report.json").read_text())["energy"]
+    assert energy[-1]["total"] < energy[0]["total"]
+    assert found["hps"].provenance["refine"] == "hps"
+    assert "refine" not in found["none"].provenance
+    assert not torch.equal(found["hps"].R_parent_joint, found["none"].R_parent_joint)
+
+
+def test_validation_logs_captures_before_and_after_their_refinement(checkpoint):
+    with open(checkpoint.parents[1] / "metrics.csv", newline="") as file:
+        logged = {key: float(value) for row in csv.DictReader(file) for key, value in row.items() if value}
+    before, after = ({key for key in logged if key.startswith(step)} for step in ("capture/", "refined/"))
+    assert "capture/world_mpjpe_cm" in before
+    assert {key.replace("capture/", "refined/") for key in before} == after
+    assert all(math.isfinite(logged[key]) for key in ("refined/mpjpe_cm", "refined/world_mpjpe_cm"))
+    assert logged["capture/world_mpjpe_cm"] != logged["refined/world_mpjpe_cm"]
+    assert list((checkpoint.parents[1] / "pictures").glob("*.png"))
 
 
 def test_windows_and_model_must_see_the_same(data, places, tmp_path):

@@ -24,7 +24,7 @@ from hydra.errors import (
     OverrideParseException,
 )
 from hydra.types import RunMode
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -40,7 +40,7 @@ from wearcap.reading import read
 from wearcap.recording import RecordingStore
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.needs import Need
-from wearcap.runtime.system import CaptureInput, System, training_of
+from wearcap.runtime.system import CaptureInput, LearnedSystem, System, training_of
 
 
 def splits_dir() -> Path:
@@ -326,13 +326,16 @@ def load_pipeline(
 
 def load_systems(given: Sequence[str | Path], pipeline: Any, device: str, shared: bool = False) -> list[System]:
     """The system of a pipeline config with all checkpoints, or one system for each of them; raises as `load_pipeline`."""
+    kind: type[System] = get_class(pipeline["_target_"])
+    if "refine" in pipeline and not issubclass(kind, LearnedSystem):
+        what = f"refine=…, but {kind.__name__} is no system whose network predicts a motion"
+        raise WearcapError(what, fix="Leave refine=… out, or choose another pipeline=….")
     made = instantiate(pipeline, _convert_="all")
     if isinstance(made, System):
         if given:
             what = f"a checkpoint, but {type(made).__name__} has no network"
             raise WearcapError(what, where=given[0], fix="Leave checkpoint=… out, or choose another pipeline=….")
         return [made]
-    kind: type[System] = made.func
     given = given or (list(kind.shared) if shared else [])
     if not given:
         fix = "Give checkpoint=…, or a pipeline without one, such as pipeline=hps."

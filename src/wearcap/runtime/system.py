@@ -8,7 +8,7 @@ import importlib
 import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
@@ -209,8 +209,16 @@ def training_of(checkpoint: str | Path) -> tuple[str, type[System] | None]:
     return getattr(training, "__name__", "another model"), getattr(training, "system", None)
 
 
+Refine = Callable[[Motion, CaptureInput], Captured]
+"""A step that improves a captured motion by what its recording holds, such as `systems.hps.refining.HpsRefinement`."""
+
+
+@dataclass(eq=False)
 class LearnedSystem(System):
     """A system around one trained network."""
+
+    refine: Refine | None = field(default=None, kw_only=True)
+    """Step after the network's motion of whole recordings (refine=hps); None: the motion stays as it is."""
 
     baselines = ("mean pose", "nearest window")
 
@@ -232,4 +240,20 @@ class LearnedSystem(System):
         once = {id(recording): CaptureInput.of(recording) for recording in recordings}
         motions = self.motions([once[id(recording)] for recording in recordings], seeds)
         notes = [motion.provenance.get("note") for motion in motions]
-        return [Captured(motion, {"notes": [note]} if note else None) for motion, note in zip(motions, notes)]
+        found = [Captured(motion, {"notes": [note]} if note else None) for motion, note in zip(motions, notes)]
+        if self.refine is None:
+            return found
+        return [_refined(self.refine, each, once[id(recording)]) for each, recording in zip(found, recordings)]
+
+    def session_class(self) -> Any:
+        """As of `System`. Raises WearcapError with a refinement, too, which needs the whole recording."""
+        if self.refine is not None:
+            raise WearcapError("a stream with refine=…, which needs whole recordings", fix="Leave refine=… out.")
+        return super().session_class()
+
+
+def _refined(refine: Refine, captured: Captured, source: CaptureInput) -> Captured:
+    """A capture after its refinement, with the reports of both."""
+    assert captured.motion is not None
+    refined = refine(captured.motion, source)
+    return Captured(refined.motion, (captured.report or {}) | (refined.report or {}))

@@ -13,7 +13,7 @@ from rich.progress import TaskID
 from wearcap.metrics.table import aggregate
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import first_seconds
-from wearcap.runtime.system import CaptureInput, System
+from wearcap.runtime.system import CaptureInput, Refine, System
 from wearcap.training.base import Training
 
 
@@ -38,9 +38,11 @@ class CaptureValidation(Callback):
         max_seconds: float = 20.0,
         every_n_epochs: int = 5,
         draw: Callable[[Path, dict[str, Motion]], None] | None = None,
+        refine: Refine | None = None,
     ):
-        """`pipeline` is called with the module's `pipeline_parts`; `draw` writes an image of labelled motions."""
-        self.pipeline, self.folder = pipeline, Path(folder)
+        """`pipeline` is called with the module's `pipeline_parts`; `draw` writes an image of labelled motions. The
+        captures' metrics after `refine` are logged beside those before it."""
+        self.pipeline, self.folder, self.refine = pipeline, Path(folder), refine
         self.recordings, self.max_seconds, self.every_n_epochs = recordings, max_seconds, every_n_epochs
         self.draw = draw
 
@@ -56,14 +58,21 @@ class CaptureValidation(Callback):
         sources = [CaptureInput.in_dataset(recording, store.root) for recording in recordings]
         # Lightning validates in inference mode, whose tensors a pipeline's own gradient steps cannot use.
         with torch.inference_mode(False), torch.no_grad():
-            motions = [captured.motion for captured in pipeline.capture(sources, [0] * len(sources))]
-            rows = [pipeline.score(motion, source, 0) for motion, source in zip(motions, sources) if motion]
-        for key, summary in aggregate(rows).items():
-            pl_module.log(f"capture/{key}", summary.mean, rank_zero_only=True)
+            motions = {"capture": [captured.motion for captured in pipeline.capture(sources, [0] * len(sources))]}
+            if self.refine is not None:
+                pairs = zip(motions["capture"], sources)
+                motions["refined"] = [motion and self.refine(motion, source).motion for motion, source in pairs]
+            scores = {
+                step: aggregate([pipeline.score(motion, source, 0) for motion, source in zip(found, sources) if motion])
+                for step, found in motions.items()
+            }
+        for step, summaries in scores.items():
+            for key, summary in summaries.items():
+                pl_module.log(f"{step}/{key}", summary.mean, rank_zero_only=True)
         pl_module.get_submodule("net").train()
         if self.draw is not None:
             path = self.folder / f"step_{trainer.global_step:06d}_{recordings[0].name}.png"
-            self.draw(path, {"truth": recordings[0].motion, "capture": motions[0]})
+            self.draw(path, {"truth": recordings[0].motion} | {step: found[0] for step, found in motions.items()})
 
 
 class StepsProgressBar(RichProgressBar):

@@ -196,7 +196,9 @@ class HpsData:
     contact: Float[Tensor, "time patch"]
     steps: SuitSteps
     surface: SurfaceIndex | None = None
-    """Surface of the scan; None: without scene."""
+    """Surface of the scan; None: without scan."""
+    floor_height: Float[Tensor, "time"] | None = None
+    """Height (m) of the level floor below each frame, which stands in for the scan; None: without floor."""
 
     def __len__(self) -> int:
         return len(self.start)
@@ -212,6 +214,7 @@ class HpsData:
             cam_confidence=self.cam_confidence[frames],
             hold_confidence=self.hold_confidence[frames],
             contact=self.contact[frames],
+            floor_height=None if self.floor_height is None else self.floor_height[frames],
             steps=SuitSteps(*(part[pairs] for part in vars(self.steps).values())),
         )
 
@@ -229,8 +232,10 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
     """Query the scene below patch vertices in contact (m, world), as far as the energy needs it.
 
     Returns by name the nearest scene point v(n) of each vertex (eq. 4.6), origin and normal of the plane below its
-    patch's centroid, and "ground_found": 1 where these exist, else 0; without a scene it is 0 everywhere.
+    patch's centroid, and "ground_found": 1 where these exist, else 0; without scan and floor it is 0 everywhere.
     """
+    if data.floor_height is not None:
+        return _level_ground(data.floor_height, points.detach())
     to_point, to_plane = energy.reading("ground_point"), energy.reading("ground_normal")
     if data.surface is None or not (to_point or to_plane):
         none = torch.zeros_like(points.detach())
@@ -251,6 +256,14 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
         found *= normal[..., 2] > LEAST_UPRIGHT  # False where no plane was found (NaN)
     parts = (point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
     return {name: part.to(dtype) for name, part in zip(_GROUND, parts)}
+
+
+def _level_ground(height: Float[Tensor, "time"], points: Float[Tensor, "time vertex 3"]) -> dict[str, Tensor]:
+    """As `find_ground`, on a floor that is level in each frame."""
+    below, up = points.clone(), torch.zeros_like(points)
+    below[..., 2], up[..., 2] = height[:, None], 1
+    found = ((points - below).abs().amax(-1) <= SURFACE_REACH_M).to(points)
+    return dict(zip(_GROUND, (below, below, up, found)))
 
 
 def data_values(data: HpsData, ground: dict[str, Tensor]) -> dict[str, Tensor]:

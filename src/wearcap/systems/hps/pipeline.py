@@ -202,8 +202,10 @@ class HPS(StagedSystem):
         Contacts are the suit's flags, or follow from its feet's speed where it has none; without patches that move faster
         than `max_contact_speed`. Raises WearcapError when there is not one per frame.
         """
-        motion, (_, localization, _) = start.motion, required(recording)
-        R_cam, sure = at_frames(localization, motion)
+        motion = start.motion
+        require(recording, "localization")
+        assert recording.localization is not None
+        R_cam, sure = at_frames(recording.localization, motion)
         root, head = motion.R_parent_joint[:, 0].double(), motion.joint("head").R.double()
         if R_head_cam is None:
             R_head_cam = estimate_head_camera(head, R_cam, sure)
