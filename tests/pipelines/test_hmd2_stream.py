@@ -319,7 +319,7 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
         at = torch.tensor([0.1 * i, 0.0, 1.6])
         points = at + 8 * torch.rand(100, 3, generator=random) - 4
         pushed(session, [[HeadSample(i / 60, Rigid(torch.eye(3), at), points)]])
-    places = session.streams[0].places
+    places = session.streams[0].sensing.places
     kept = torch.cat([points for points, _ in places._tracked + places._new])
     assert len(kept) == len(places.map) <= 2000 + 1000
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
@@ -332,7 +332,7 @@ def test_a_long_stream_needs_no_more_than_a_short_one(pipeline):
     for lap in range(30):
         pushed(session, [[moment._replace(timestamp=moment.timestamp + 2 * lap) for moment in conditions]])
         if lap % 5 == 4:
-            sizes.append(len(pickle.dumps(vars(session.streams[0].places) | vars(session.streams[0].track))))
+            sizes.append(len(pickle.dumps(vars(session.streams[0].sensing.places) | vars(session.streams[0]._track))))
     assert max(sizes[3:]) <= 1.02 * max(sizes[:3])
 
 

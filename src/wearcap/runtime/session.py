@@ -1,7 +1,7 @@
 """Streaming captures: samples go in as devices send them, final poses come out."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
 from jaxtyping import Float
@@ -13,8 +13,9 @@ from wearcap.recording import Motion
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors.packets import Admitted, HeadInput, WristInput
-from wearcap.sensors.samples import ActiveObject, ObjectSample
+from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample
 from wearcap.tracking.head_path import Chunk, HeadTrack
+from wearcap.tracking.refinement import Measured, Refiner
 
 
 class Session:
@@ -92,21 +93,19 @@ class Session:
         return [stream.poses(ended) for stream in self.streams]
 
 
-class HeadAndWristsStream(ABC):
-    """The streaming capture of one wearer with a head device and sensors on both wrists, on one clock.
+class HeadStream(ABC):
+    """The streaming capture of one wearer, whose clock is that of a head device.
 
     Invalid packets (`sensors.packets`) are counted as `refused`. If the head device's clock is set back for good, the
     capture restarts like a new session.
     """
 
-    def __init__(self, pipeline: Any, fps: float, stride: int):
-        """`fps`: frame rate of the poses (Hz); `stride`: frames of a chunk of the head's path."""
-        pipeline.prepare()
-        self.pipeline = pipeline
-        self.silent = 0
-        """Number of frames without samples of a wrist, counted per wrist."""
-        self._head_input, self._track = HeadInput(), HeadTrack(fps, stride)
-        self._wrists = WristInput(self._head_input)
+    def __init__(self, pipeline: Any, wearer: Wearer, stride: int, anchored: bool):
+        """`stride`: frames of a chunk of the head's path; `anchored`: whether the head joint is put where it is measured."""
+        self.pipeline, self.wearer, self._anchored = pipeline, wearer, anchored
+        self._head_input, self._track = HeadInput(), HeadTrack(pipeline.fps, stride)
+        self._refiner: Refiner | None = None
+        """Refines the present stretch."""
         self._finished: list[Motion] = []
         """Final motions with times of a previous clock, not returned yet."""
 
@@ -120,33 +119,61 @@ class HeadAndWristsStream(ABC):
         """Number of refused samples, or parts of samples, by reason ("head: not a rotation")."""
         return dict(self._head_input.refused)
 
+    @property
+    def behind(self) -> bool:
+        """Whether motions of a previous clock wait to be returned first."""
+        return bool(self._finished)
+
     @abstractmethod
     def take(self, sample: Any) -> None:
         """Take in one sample (`sensors.samples`)."""
 
-    def head(
-        self, timestamp: float, T_world_device: Rigid | None, points_world: Float[Tensor, "point 3"] | None = None
-    ) -> None:
-        """Take in one time step (s) of the head device: its pose (None while tracking is lost) and new points (m)."""
-        if self._head_input.timely(timestamp):
-            packet = self._head_input.pose(T_world_device), self._head_input.points(points_world)
-            self._take(self._head_input.admit(float(timestamp), packet))
-
-    def _take(self, admitted: Admitted) -> None:
+    def _admit(self, sample: HeadSample) -> None:
+        """Check one time step of the head device, and take in what its clock accepts now."""
+        if not self._head_input.timely(sample.timestamp):
+            return
+        admitted = self._head_input.admit(float(sample.timestamp), self._checked(sample))
         if admitted.begins:
             if admitted.again and (motion := self._final(ended=True)) is not None:
                 self._finished.append(motion)
-            self._restart(admitted.again)
-            self._wrists.rejoin(None if admitted.again else admitted.packets[0][0])
-        for time, (pose, _) in admitted.packets:
-            self._track.take(time, pose)
+            self._restart(admitted)
+        for _, accepted in admitted.packets:
+            self._accept(accepted)
 
-    def _restart(self, again: bool = False) -> None:
-        """Restart the capture, with `again` on another clock; wrist samples and counters are kept."""
-        dropped = self._track.dropped
+    def _checked(self, sample: HeadSample) -> HeadSample:
+        """Copies of the sample's valid parts."""
+        head = self._head_input
+        return HeadSample(float(sample.timestamp), head.pose(sample.T_world_device), head.points(sample.points_world))
+
+    def _accept(self, sample: HeadSample) -> None:
+        """Take in a checked sample."""
+        self._track.take(sample.timestamp, sample.T_world_device)
+
+    def _restart(self, admitted: Admitted) -> None:
+        """Restart the capture with these packets, perhaps on another clock; counters are kept."""
+        dropped, self._refiner = self._track.dropped, None
         self._track = HeadTrack(self._track.fps, self._track.stride)
         self._track.dropped = dropped
-        self._chunks: list[Chunk] = []
+
+    def _refined(self, motion: Motion, measured: Measured) -> list[Motion]:
+        """The next frames of a stretch as the pipeline refines them; its final ones, as a list of at most one motion."""
+        if self._refiner is None:
+            self._refiner = Refiner(self.pipeline.refinement, motion.skeleton, self.pipeline.fps, self._anchored)
+        return self._refiner.push(motion, measured)
+
+    def _refined_rest(self) -> list[Motion]:
+        """The frames that wait for refinement at the end of a stretch."""
+        refiner, self._refiner = self._refiner, None
+        return [] if refiner is None else refiner.finish()
+
+    def _head_of(self, T_world_device: Rigid) -> Rigid:
+        """Poses of the head joint, from those of the device on it."""
+        return T_world_device @ Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
+
+    def end(self) -> None:
+        """Take in the packets that wait for others, as no more samples will come."""
+        for _, accepted in self._head_input.end():
+            self._accept(accepted)
 
     def poses(self, ended: bool = False) -> Motion | None:
         """Frames that became final since the last call, or None; `ended`: no more samples will come.
@@ -154,10 +181,44 @@ class HeadAndWristsStream(ABC):
         After the head device's clock was set back, the frames before come first; call again for the new clock's.
         """
         if ended:
-            for time, (pose, _) in self._head_input.end():
-                self._track.take(time, pose)
+            self.end()
         return self._finished.pop(0) if self._finished else self._final(ended)
 
     @abstractmethod
     def _final(self, ended: bool) -> Motion | None:
         """Frames on the present clock that became final, or None."""
+
+
+class HeadAndWristsStream(HeadStream):
+    """The streaming capture of one wearer with a head device and sensors on both wrists, on one clock."""
+
+    def __init__(self, pipeline: Any, wearer: Wearer, stride: int):
+        pipeline.prepare()
+        super().__init__(pipeline, wearer, stride, pipeline.anchor)
+        self.silent = 0
+        """Number of frames without samples of a wrist, counted per wrist."""
+        self._wrists = WristInput(self._head_input)
+        self._chunks: list[Chunk] = []
+        """Frames that wait for the wrists."""
+
+    def head(
+        self, timestamp: float, T_world_device: Rigid | None, points_world: Float[Tensor, "point 3"] | None = None
+    ) -> None:
+        """Take in one time step (s) of the head device: its pose (None while tracking is lost) and new points (m)."""
+        self._admit(HeadSample(timestamp, T_world_device, points_world))
+
+    def _restart(self, admitted: Admitted) -> None:
+        super()._restart(admitted)
+        self._wrists.rejoin(None if admitted.again else admitted.packets[0][0])
+        self._chunks = []
+
+    def _ready(self, ended: bool) -> Iterator[Chunk]:
+        """The next chunks for which both wrists have delivered their samples, or are silent."""
+        while (chunk := self._track.next(ended)) is not None:
+            self._chunks.append(chunk)
+        while self._chunks and (ended or self._complete(self._chunks[0])):
+            yield self._chunks.pop(0)
+
+    @abstractmethod
+    def _complete(self, chunk: Chunk) -> bool:
+        """Whether the wrists' samples that a chunk needs have arrived, or will not come."""

@@ -1,5 +1,7 @@
-"""A stream's map of the points around its wearer: voxel grids for the model, and the floor below the head."""
+"""A wearer's map of the points around: voxel grids for the model, and the floor below the head."""
 
+import math
+import sys
 from dataclasses import dataclass
 
 import torch
@@ -29,6 +31,10 @@ class Memory:
             raise WearcapError(what, expected="at least 1000 points within at least 5 m")
 
 
+EVERYTHING = Memory(math.inf, sys.maxsize)
+"""Of a whole recording: nothing is dropped."""
+
+
 class Places:
     """Points around one wearer and the floor below, as seen so far."""
 
@@ -45,14 +51,15 @@ class Places:
         self._center: Tensor | None = None
         """Head position at which distant points were dropped last (m)."""
 
-    def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
-        """Add points (m) that were first seen at a time (s); points that are not finite are left out."""
+    def add(self, points_world: Float[Tensor, "point 3"], first_seen: Float64[Tensor, "point"] | None) -> None:
+        """Add points (m) with the times they were first seen (s), None: always; points that are not finite are left
+        out."""
         points = points_world.detach().float().cpu()
-        points = points[points.isfinite().all(-1)]
-        seen = torch.full((len(points),), first_seen, dtype=torch.float64)
-        self.mapped = True
+        finite, self.mapped = points.isfinite().all(-1), True
+        seen = torch.full((len(points),), -math.inf, dtype=torch.float64) if first_seen is None else first_seen
+        points, seen = points[finite], seen[finite]
         self.map.add(points, seen)
-        self._new.append((points, seen))
+        self._new.append(_in_order(points, seen))
         if len(self.map) <= MANY * self.memory.max_points:
             return
         # No frame arrives that would drop distant points: only the newest packets of new ones are kept.
@@ -66,23 +73,29 @@ class Places:
     def floor(
         self, timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]
     ) -> Float[Tensor, "time"]:
-        """Floor height (m) below the head at the next frames, updated as in `tracking.floor.tracked_floor`."""
+        """Floor height (m) below the head at the next frames, from the points and the path so far."""
         parts, done = [], 0
         while done < len(timestamps):
-            if self._floor.frames % LOOK_FRAMES == 0:  # the tracker gets the points that were seen by now
-                until = timestamps[done].item()
-                shown = [part for part in self._new if len(part[1]) and part[1][0] <= until]
-                if shown:
-                    self._new = [part for part in self._new if len(part[1]) and part[1][0] > until]
-                    self._tracked.append(_joined(shown))
-                    self._floor.see(self._tracked[-1][0])
-                if len(self._tracked) > 1000:
-                    self._tracked = [_joined(self._tracked)]
+            if self._floor.frames % LOOK_FRAMES == 0:
+                self._show(timestamps[done].item())
             ready = LOOK_FRAMES - self._floor.frames % LOOK_FRAMES
             parts.append(self._floor.follow(t_world_head[done : done + ready]))
             done += ready
         self._forget(t_world_head[-1])
         return torch.cat(parts)
+
+    def _show(self, until_s: float) -> None:
+        """Give the tracker the points that were seen by a time."""
+        if not self._new:
+            return
+        points, seen = _in_order(*_joined(self._new)) if len(self._new) > 1 else self._new[0]
+        count = int(torch.searchsorted(seen, until_s, right=True))
+        self._new = [(points[count:], seen[count:])] if count < len(points) else []
+        if count:
+            self._tracked.append((points[:count], seen[:count]))
+            self._floor.see(points[:count])
+        if len(self._tracked) > 1000:
+            self._tracked = [_joined(self._tracked)]
 
     def _forget(self, t_world_head: Float[Tensor, "3"]) -> None:
         """Drop distant and old points once the wearer has walked far or there are too many points."""
@@ -104,6 +117,13 @@ class Places:
             self.map.add(points, seen)
         for points, _ in tracked:
             self._floor.see(points)
+
+
+def _in_order(
+    points: Float[Tensor, "point 3"], seen: Float64[Tensor, "point"]
+) -> tuple[Float[Tensor, "point 3"], Float64[Tensor, "point"]]:
+    seen, order = seen.sort(stable=True)
+    return points[order], seen
 
 
 def _joined(parts: list[tuple[Tensor, Tensor]]) -> tuple[Float[Tensor, "point 3"], Float64[Tensor, "point"]]:

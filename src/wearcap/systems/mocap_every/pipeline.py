@@ -1,11 +1,11 @@
 """MocapEvery (Lee and Joo 2024): full-body motion from two watches and a head-mounted camera, on stairs and hills."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from einops import repeat
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, Skeleton
@@ -23,10 +23,10 @@ from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
 from wearcap.sensors.watches import FILTER, watch_gaps, watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
-from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
-from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
+from wearcap.systems.mocap_every.features import Sensed, synthetic_wrists
+from wearcap.systems.mocap_every.model import Estimate
 from wearcap.systems.mocap_every.visual_cues import VisualCues
-from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
+from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses, Sliding, WatchModel
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import CARRIED, floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
@@ -46,18 +46,6 @@ class CapturedWithFloor:
     """Floor height that conditioned the estimator."""
     edits: list[LatentSolution]
     """Solutions of the editing by visual cues, one per batch of windows."""
-
-
-@dataclass(frozen=True, eq=False)
-class WatchModel:
-    """What a training gives a capture: the estimator, and what it was trained with."""
-
-    net: WatchEstimator
-    features: WatchFeatures
-    skeleton: Skeleton
-    """Skeleton for recordings without their own."""
-    fps: float
-    """Frame rate of the estimator (Hz)."""
 
 
 @dataclass
@@ -136,18 +124,18 @@ class MocapEvery(LearnedSystem):
         # 1. head path and watches on a common clock
         path = head_path(recording, self.model.skeleton, self.model.fps)
         sensed = self._sensed(recording, path)
+        known = None
+        if self.floor == "points":  # below the head; from the head path where there are too few points
+            known = floor_from_points(recording.points, path.T_world_head.t, path.stature)
+            known = path.floor_below(self.carried) if known is None else known
         # 2. end-effectors, contacts and poses, window by window; 3. floor height from the feet in contact
-        output = [self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
+        output = [self._capture_stretch(recording, path, sensed, known, *stretch) for stretch in path.stretches]
         frames = path.held_frames  # in the gaps between stretches the last pose goes on, at the interpolated head
         whole = FinalPoses(*(torch.cat(part)[frames] for part in zip(*output)))
-        poses = path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root
-        contact_prob = repeat(whole.contact_prob, "time foot -> time (foot patch)", patch=2)
-        gaps = watch_gaps(recording.imu, path.timestamps)
-        about = self.settings() | ({"note": "; ".join(gaps)} if gaps else {})
-        motion = Motion(*poses, contact_prob, provenance=about)
         # 4. anchor the body to the measured head
-        if self.anchor:
-            motion = anchored_to_head(motion, path.T_world_head)
+        motion = self.motion(path.timestamps, path.skeleton, path.T_world_head, whole)
+        if gaps := watch_gaps(recording.imu, path.timestamps):
+            motion = replace(motion, provenance=motion.provenance | {"note": "; ".join(gaps)})
         # 5. smooth it, hold its feet, and bend its arms to tracked hands
         if self.refinement is not None:
             motion = self._refined(motion, self.refinement, path, sensed, whole.floor_height)
@@ -199,38 +187,44 @@ class MocapEvery(LearnedSystem):
         return Sensed(R, t, *watches_at(recording.imu, path.timestamps, recording.name), torch.zeros(len(t), 2, 3))
 
     def _capture_stretch(
-        self, recording: Recording, path: HeadPath, sensed: Sensed, start: int, stop: int
+        self,
+        recording: Recording,
+        path: HeadPath,
+        sensed: Sensed,
+        floor_height: Float[Tensor, "time"] | None,
+        start: int,
+        stop: int,
     ) -> FinalPoses:
-        """Run the sliding windows over the path's frames from `start` to `stop`."""
+        """Run the sliding windows over the path's frames from `start` to `stop`; `floor_height` (m) where it is known."""
         if (track := recording.floor) is not None:  # the measured floor, the paper's h_0
             begin = path.timestamps[start : start + 1]
             initial_m = interpolate_clamped(track.timestamps, track.height, begin).item()
         else:
             initial_m = path.floor_below(self.carried)[start].item()
-        floor, floor_height = self.follower(path.skeleton, initial_m), None
-        if self.floor == "points":  # below the head; from the head path where there are too few points
-            height = floor_from_points(recording.points, path.T_world_head.t, path.stature)
-            floor_height = path.floor_below(self.carried) if height is None else height
-        cloud = recording.points if self.floor in ("follow", "update") else None
-        if cloud is not None and cloud.first_seen is None:
-            floor.see(cloud.points_world)
-        windows, parts, seen_until = EstimatorWindows(self, path.skeleton, floor), [], -torch.inf
-        for first in range(start, stop, self.stride):
-            last = min(first + self.stride, stop)
-            if cloud is not None and (when := cloud.first_seen) is not None:
-                until = path.timestamps[last - 1].item()
-                fresh, seen_until = (when > seen_until) & (when <= until), until
-                if fresh.any():
-                    floor.see(cloud.points_world[fresh])
-            if floor_height is not None:
-                assert isinstance(floor, FloorFixed)
-                floor.height = floor_height[first].item()
-            parts.append(windows.advance(Sensed(*(part[first:last] for part in sensed))))
-        parts.append(windows.finish())
-        return FinalPoses(*(torch.cat(part) for part in zip(*parts)))
+        windows, part = self.windows(path.skeleton, initial_m), slice(start, stop)
+        if recording.points is not None and self.floor in ("follow", "update"):
+            windows.see(recording.points.points_world, recording.points.first_seen)
+        known = None if floor_height is None else floor_height[part]
+        windows.push(path.timestamps[part], Sensed(*(field[part] for field in sensed)), known)
+        final = windows.take(ended=True)
+        assert final is not None
+        return final
 
-    def follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:
-        """Floor follower of the configured kind, with an initial height (m)."""
+    def windows(self, skeleton: Skeleton, floor_m: float) -> EstimatorWindows:
+        """Windows over a stretch that begins at a height of the floor (m), with a follower of the configured kind."""
+        how = self.stride, self.lookahead, self.mirror_average
+        return EstimatorWindows(Sliding(self.model, self.estimate, *how), skeleton, self._follower(skeleton, floor_m))
+
+    def motion(
+        self, timestamps: Float64[Tensor, "time"], skeleton: Skeleton, T_world_head: Rigid, final: FinalPoses
+    ) -> Motion:
+        """Step 4: estimated poses as a motion, anchored to the measured head."""
+        contact_prob = repeat(final.contact_prob, "time foot -> time (foot patch)", patch=2)
+        poses = final.R_parent_joint, final.t_world_root, contact_prob
+        motion = Motion(timestamps, skeleton, *poses, provenance=self.settings())
+        return anchored_to_head(motion, T_world_head) if self.anchor else motion
+
+    def _follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:
         if self.floor == "update":
             return FloorUpdate(initial_m)
         if self.floor == "follow":

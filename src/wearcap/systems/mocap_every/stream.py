@@ -15,7 +15,6 @@ from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
-from wearcap.geometry.rigid import Rigid
 from wearcap.recording import ImuStream, Motion
 from wearcap.recording.timing import joined
 from wearcap.runtime.session import HeadAndWristsStream, Session
@@ -26,10 +25,9 @@ from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, filtered
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
-from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
-from wearcap.tracking.anchor import anchored_to_head
+from wearcap.systems.mocap_every.windows import EstimatorWindows
 from wearcap.tracking.head_path import Chunk
-from wearcap.tracking.refinement import Measured, Refiner
+from wearcap.tracking.refinement import Measured
 
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
@@ -43,25 +41,26 @@ class MocapEveryStream(HeadAndWristsStream):
     """
 
     def __init__(self, pipeline: MocapEvery, wearer: Wearer):
-        super().__init__(pipeline, pipeline.model.fps, pipeline.stride)
-        self.wearer = wearer
-        self._restart()
+        super().__init__(pipeline, wearer, pipeline.stride)
+        self._begin()
 
-    def _restart(self, again: bool = False) -> None:
-        super()._restart(again)
+    def _begin(self) -> None:
         self._windows: EstimatorWindows | None = None
         self._begin_s = 0.0
-        self._points: list[Tensor] = []
-        self._times = torch.zeros(0, dtype=torch.float64)
-        self._heads = Rigid(torch.zeros(0, 3, 3), torch.zeros(0, 3))
-        """Head poses of frames that were consumed but not returned yet."""
-        self._refiner: Refiner | None = None
+        self._points: list[tuple[float, Tensor]] = []
+        """Points (m) that no windows have yet, and the times (s) they were first seen."""
 
-    def _take(self, admitted: Admitted) -> None:
-        super()._take(admitted)
-        self._points += [points for _, (_, points) in admitted.packets if points is not None and len(points)]
+    def _restart(self, admitted: Admitted) -> None:
+        super()._restart(admitted)
+        self._begin()
+
+    def _accept(self, sample: HeadSample) -> None:
+        super()._accept(sample)
+        if sample.points_world is not None and len(sample.points_world):
+            self._points.append((sample.timestamp, sample.points_world))
         if len(self._points) > 1000:
-            self._points = [torch.cat(self._points)[-MAX_POINTS:]]
+            points = torch.cat([points for _, points in self._points])
+            self._points = [(sample.timestamp, points[-MAX_POINTS:])]
 
     def take(self, sample: Any) -> None:
         """Take in one sample of the head camera or of a watch."""
@@ -91,15 +90,14 @@ class MocapEveryStream(HeadAndWristsStream):
             values = packets.owned(sample.R_world_imu), packets.owned(sample.acc_world)
             self._wrists.add(joint, WatchSample(float(sample.timestamp), *values))
 
+    @torch.inference_mode()
     def _final(self, ended: bool) -> Motion | None:
-        while (chunk := self._track.next(ended)) is not None:
-            self._chunks.append(chunk)
         motions: list[Motion] = []
-        end_s = self._chunks[-1].timestamps[-1].item() if ended and self._chunks else math.inf
-        while self._chunks and (ended or self._complete(self._chunks[0])):
-            motions += self._advance(self._chunks.pop(0), end_s)
-        if ended and self._windows is not None:
-            motions += self._end(self._windows)
+        for chunk in self._ready(ended):
+            last = (self._chunks or [chunk])[-1]
+            motions += self._advance(chunk, last.timestamps[-1].item() if ended else math.inf)
+        if ended:
+            motions += self._emit(ended)
             self._windows = None
         return joined(motions)
 
@@ -109,32 +107,25 @@ class MocapEveryStream(HeadAndWristsStream):
         needed = last + (FILTER // 2 + 0.5) / self.pipeline.model.fps
         return self._wrists.arrived(needed, last, self._track.newest, MAX_GAP_S)
 
-    @torch.inference_mode()
     def _advance(self, chunk: Chunk, end_s: float) -> list[Motion]:
         """Run the windows over one chunk of frames; `end_s`: time of the last frame (s), once known."""
-        motions: list[Motion] = []
-        mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
-        T_world_head = chunk.T_world_device @ mount
+        motions, skeleton, T_world_head = [], self.wearer.skeleton, self._head_of(chunk.T_world_device)
         if chunk.begins or self._windows is None:
-            if self._windows is not None:
-                motions += self._end(self._windows)
+            motions += self._emit(ended=True)
             self._begin_s = chunk.timestamps[0].item()
             floor_m = self.wearer.floor_m if self._windows is None else self._windows.floor_m
             if floor_m is None:
-                floor_m = T_world_head.t[0, 2].item() - self.pipeline.carried * self.wearer.skeleton.height_of("head")
-            follower = self.pipeline.follower(self.wearer.skeleton, floor_m)
-            self._windows = EstimatorWindows(self.pipeline, self.wearer.skeleton, follower)
+                floor_m = T_world_head.t[0, 2].item() - self.pipeline.carried * skeleton.height_of("head")
+            self._windows = self.pipeline.windows(skeleton, floor_m)
         elif len(chunk.corrected.t):
-            self._windows.correct(chunk.corrected @ mount)
-        for points in self._points:
-            self._windows.floor.see(points)
+            self._windows.correct(self._head_of(chunk.corrected))
+        for first_seen_s, points in self._points:
+            self._windows.see(points, torch.full((len(points),), first_seen_s, dtype=torch.float64))
         self._points.clear()
         R, acc = self._watches(chunk, end_s)
         sensed = Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))
-        self._times = torch.cat([self._times, chunk.timestamps])
-        R_heads, t_heads = torch.cat([self._heads.R, T_world_head.R]), torch.cat([self._heads.t, T_world_head.t])
-        self._heads = Rigid(R_heads, t_heads)
-        return motions + self._to_motion(self._windows.advance(sensed))
+        self._windows.push(chunk.timestamps, sensed)
+        return motions + self._emit()
 
     def _watches(
         self, chunk: Chunk, end_s: float
@@ -167,31 +158,14 @@ class MocapEveryStream(HeadAndWristsStream):
             self._wrists.samples[joint] = [s for s in kept if s.timestamp >= oldest_s] or kept[-1:]
         return filtered(streams, chunk.timestamps, around, step)
 
-    def _to_motion(self, output: FinalPoses) -> list[Motion]:
-        """Final frames as a motion with their times, anchored to the head; an empty list for no frames."""
-        count = len(output.t_world_root)
-        if not count:
-            return []
-        times, heads = self._times[:count], self._heads[:count]
-        self._times, self._heads = self._times[count:], self._heads[count:]
-        poses = times, self.wearer.skeleton, output.R_parent_joint, output.t_world_root
-        contact_prob = output.contact_prob.repeat_interleave(2, -1)
-        pipeline = self.pipeline
-        motion = Motion(*poses, contact_prob, provenance=pipeline.settings())
-        motion = anchored_to_head(motion, heads) if pipeline.anchor else motion
-        if pipeline.refinement is None:
-            return [motion]
-        if self._refiner is None:
-            self._refiner = Refiner(pipeline.refinement, motion.skeleton, pipeline.model.fps, pipeline.anchor)
-        return self._refiner.push(motion, Measured.of(heads, output.floor_height))
-
-    def _end(self, windows: EstimatorWindows) -> list[Motion]:
-        """The remaining frames of a stretch that has ended."""
-        motions = self._to_motion(windows.finish())
-        if self._refiner is not None:
-            motions += self._refiner.finish()
-        self._refiner = None
-        return motions
+    def _emit(self, ended: bool = False) -> list[Motion]:
+        """Motion of the frames that became final; `ended`: of all that are left of a stretch."""
+        motions: list[Motion] = []
+        if self._windows is not None and (final := self._windows.take(ended)) is not None:
+            T_world_head = final.T_world_head
+            motion = self.pipeline.motion(final.timestamps, self.wearer.skeleton, T_world_head, final)
+            motions = self._refined(motion, Measured.of(T_world_head, final.floor_height))
+        return motions + self._refined_rest() if ended else motions
 
 
 class MocapEverySession(Session):
