@@ -210,6 +210,6 @@ def test_whatever_comes_it_goes_on(pipeline, recording, seed):
     for motion in motions:
         assert motion.R_parent_joint.isfinite().all()
         assert motion.t_world_root.isfinite().all()
-    assert len(session._chunks) + len(session._finished) + len(session._track._poses) < 20
+    assert len(session._chunks) + len(session.finished) + len(session._track._poses) < 20
     assert max(map(len, session._wrists.samples.values())) < 300
     assert replace(motions[0]).skeleton == recording.skeleton

@@ -12,9 +12,10 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
+from wearcap.runtime.windows import StretchWindows
 from wearcap.sensors.packets import Admitted, HeadInput, WristInput
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample
-from wearcap.tracking.head_path import Chunk, HeadTrack
+from wearcap.tracking.head_path import MAX_GAP_S, Chunk, HeadTrack
 from wearcap.tracking.refinement import Measured, Refiner
 
 
@@ -106,7 +107,7 @@ class HeadStream(ABC):
         self._head_input, self._track = HeadInput(), HeadTrack(pipeline.fps, stride)
         self._refiner: Refiner | None = None
         """Refines the present stretch."""
-        self._finished: list[Motion] = []
+        self.finished: list[Motion] = []
         """Final motions with times of a previous clock, not returned yet."""
 
     @property
@@ -119,11 +120,6 @@ class HeadStream(ABC):
         """Number of refused samples, or parts of samples, by reason ("head: not a rotation")."""
         return dict(self._head_input.refused)
 
-    @property
-    def behind(self) -> bool:
-        """Whether motions of a previous clock wait to be returned first."""
-        return bool(self._finished)
-
     @abstractmethod
     def take(self, sample: Any) -> None:
         """Take in one sample (`sensors.samples`)."""
@@ -135,7 +131,7 @@ class HeadStream(ABC):
         admitted = self._head_input.admit(float(sample.timestamp), self._checked(sample))
         if admitted.begins:
             if admitted.again and (motion := self._final(ended=True)) is not None:
-                self._finished.append(motion)
+                self.finished.append(motion)
             self._restart(admitted)
         for _, accepted in admitted.packets:
             self._accept(accepted)
@@ -154,6 +150,11 @@ class HeadStream(ABC):
         dropped, self._refiner = self._track.dropped, None
         self._track = HeadTrack(self._track.fps, self._track.stride)
         self._track.dropped = dropped
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Begin the capture, as a new one does."""
 
     def _refined(self, motion: Motion, measured: Measured) -> list[Motion]:
         """The next frames of a stretch as the pipeline refines them; its final ones, as a list of at most one motion."""
@@ -165,6 +166,13 @@ class HeadStream(ABC):
         """The frames that wait for refinement at the end of a stretch."""
         refiner, self._refiner = self._refiner, None
         return [] if refiner is None else refiner.finish()
+
+    def _emitted(self, windows: StretchWindows[Any] | None, ended: bool = False) -> list[Motion]:
+        """Motion of the frames that a stretch's windows put out; `ended`: of all that are left of it."""
+        motions: list[Motion] = []
+        if windows is not None and (final := windows.take(ended)) is not None:
+            motions = self._refined(self.pipeline.motion(final, self.wearer.skeleton), final.measured)
+        return motions + self._refined_rest() if ended else motions
 
     def _head_of(self, T_world_device: Rigid) -> Rigid:
         """Poses of the head joint, from those of the device on it."""
@@ -182,7 +190,7 @@ class HeadStream(ABC):
         """
         if ended:
             self.end()
-        return self._finished.pop(0) if self._finished else self._final(ended)
+        return self.finished.pop(0) if self.finished else self._final(ended)
 
     @abstractmethod
     def _final(self, ended: bool) -> Motion | None:
@@ -192,10 +200,11 @@ class HeadStream(ABC):
 class HeadAndWristsStream(HeadStream):
     """The streaming capture of one wearer with a head device and sensors on both wrists, on one clock."""
 
-    def __init__(self, pipeline: Any, wearer: Wearer, stride: int):
+    def __init__(self, pipeline: Any, wearer: Wearer, stride: int, needs_s: float):
+        """`needs_s`: time after a frame until which it needs the wrists' samples."""
         pipeline.prepare()
         super().__init__(pipeline, wearer, stride, pipeline.anchor)
-        self.silent = 0
+        self._needs_s, self.silent = needs_s, 0
         """Number of frames without samples of a wrist, counted per wrist."""
         self._wrists = WristInput(self._head_input)
         self._chunks: list[Chunk] = []
@@ -216,9 +225,8 @@ class HeadAndWristsStream(HeadStream):
         """The next chunks for which both wrists have delivered their samples, or are silent."""
         while (chunk := self._track.next(ended)) is not None:
             self._chunks.append(chunk)
-        while self._chunks and (ended or self._complete(self._chunks[0])):
+        while self._chunks:
+            last = self._chunks[0].timestamps[-1].item()
+            if not (ended or self._wrists.arrived(last + self._needs_s, last, self._track.newest, MAX_GAP_S)):
+                break
             yield self._chunks.pop(0)
-
-    @abstractmethod
-    def _complete(self, chunk: Chunk) -> bool:
-        """Whether the wrists' samples that a chunk needs have arrived, or will not come."""

@@ -195,8 +195,16 @@ class Refiner:
         return offsets
 
 
-def held_in_gaps(motion: Motion, path: HeadPath, anchored: bool) -> Motion:
-    """The motion whose frames between stretches keep the pose before them, `anchored` at the interpolated head."""
+def refined_over(
+    refinement: Refinement | None, motion: Motion, measured: Measured, path: HeadPath, fps: float, anchored: bool
+) -> Motion:
+    """A motion along a path, refined; frames between stretches keep the pose before them, `anchored` at the interpolated
+    head. None: it stays."""
+    if refinement is None:
+        return motion
+    motion = refinement.refined(motion, measured, path.stretches, fps, anchored)
+    if len(path.stretches) == 1:
+        return motion
     frames = torch.cat([torch.arange(start, stop) for start, stop in path.stretches])[path.held_frames]
     held = replace(motion, R_parent_joint=motion.R_parent_joint[frames], t_world_root=motion.t_world_root[frames])
     return anchored_to_head(held, path.T_world_head) if anchored else held

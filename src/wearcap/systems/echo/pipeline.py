@@ -22,48 +22,18 @@ from wearcap.recording.active_objects import ActiveSpan, true_spans
 from wearcap.runtime.graphs import chosen
 from wearcap.runtime.needs import HEAD, HEIGHT, TRACKED_WRISTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
+from wearcap.runtime.windows import batched
 from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
 from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
-from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Guided, Outputs
+from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Guided, Outputs, Sampling
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
 from wearcap.systems.echo.windows import AveragedWindows, Rewindow
 from wearcap.systems.echo.wrists import Reaching, reaches
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import head_path
-from wearcap.tracking.refinement import Measured, Refinement, held_in_gaps
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """How frames are denoised; see `diffusion.conveyor.RollingSchedule`."""
-
-    context: int = 4
-    """Clean frames kept before the ramp: a pose is final once window - context - 1 more frames have arrived."""
-    per_frame: int = 2
-    """Denoising steps per new frame; with a window of 60 and a context of 4 a frame takes 112 in all (ECHO: 100)."""
-    spacing: float = 2.0
-    eta: float = 0.0
-    step: str = "posterior"
-    lead: float = 0.0
-    """Share by which the contacts' ramp of levels is shorter: they are denoised before body and object (ours)."""
-    observed_length_scale: float | None = 8.0
-    """Length scale (frames) of the Gaussian process by which an observed frame's residual of x̂0 reaches its neighbours (ours); None: not at all."""
-    wrists: float | None = 0.3
-    """Share of its distance from the tracked wrists by which x̂0 approaches them in every step (ours); None: not at all
-    (ECHO)."""
-    rewindow: int | None = None
-    """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor (ECHO)."""
-    rewindow_steps: int | None = None
-    """Denoising steps of such a window: 1 leads to the mean of the plausible motions; None: as many as a frame takes on
-    the conveyor."""
-    average: bool = False
-    """Whether what these windows predict for a frame is averaged (ours; they then advance by no more than half of the window
-    less the context, so that two at least predict each frame), or their overlap is inpainted (ECHO Fig. 3)."""
-    mirror_average: bool = False
-    """Mirror test-time augmentation of averaged windows: the prediction for the mirrored window is averaged in (ours)."""
-
+from wearcap.tracking.refinement import Measured, Refinement, refined_over
 
 MAX_ENVIRONMENTS = 16
 """Most environments that a pipeline keeps in memory."""
@@ -75,7 +45,7 @@ class Echo(LearnedSystem):
     batching does not change results."""
 
     model: EchoModel
-    sampling: Sampling = Sampling()
+    sampling: Sampling = field(default_factory=Sampling)
     contacts: ContactUse = field(default_factory=ContactUse)
     anchor: bool = True
     """Whether the body is anchored to the measured head (ours) or keeps its sampled position (ECHO)."""
@@ -249,12 +219,13 @@ class Echo(LearnedSystem):
             [scenarios[k].recording.shape for k, *_ in parts],
             [items[k].objects for k, *_ in parts],
         )
-        conditioning, frames = [], torch.arange(max(stop - start for _, start, stop in parts))
-        for k, start, stop in parts:  # the last frame repeated as not valid pads a stretch
-            padded, inside = items[k].conditioning.frames((start + frames).clamp_max(stop - 1)), frames < stop - start
-            is_observed = padded.is_observed & inside[:, None]
-            conditioning.append(padded._replace(valid=padded.valid & inside, is_observed=is_observed))
-        together = queue.run(Conditioning(*(torch.cat(fields) for fields in zip(*conditioning))))
+        lengths = torch.tensor([stop - start for _, start, stop in parts])
+        stretches = [items[k].conditioning.frames(slice(start, stop)) for k, start, stop in parts]
+        whole = batched(stretches, int(lengths.max()))
+        # The last frame repeated as not valid pads a stretch.
+        inside = torch.arange(whole.valid.shape[1]) < lengths[:, None]
+        whole = whole._replace(valid=whole.valid & inside, is_observed=whole.is_observed & inside[..., None])
+        together = queue.run(whole)
         found: list[list[Outputs]] = [[] for _ in items]
         for row, (k, start, stop) in enumerate(parts):
             found[k].append(Outputs(*(field[row : row + 1, : stop - start] for field in together)))
@@ -269,15 +240,10 @@ class Echo(LearnedSystem):
         settings, contacts = self.settings(), self.model.contacts
         motions = [motion_of(item, part, self.anchor, settings, contacts) for item, part in zip(items, outputs)]
         # 4. It is smoothed, its feet are held, and its arms reach the tracked wrists.
-        return [self._refined(motion, item) for motion, item in zip(motions, items)]
-
-    def _refined(self, motion: Motion, item: BatchItem) -> Motion:
-        """Step 4; the frames between stretches keep the refined pose before them."""
-        if self.refinement is None:
-            return motion
-        path = item.path
-        motion = self.refinement.refined(motion, measured_of(item), path.stretches, self.fps, self.anchor)
-        return motion if len(path.stretches) == 1 else held_in_gaps(motion, path, self.anchor)
+        return [
+            refined_over(self.refinement, motion, measured_of(item), item.path, self.fps, self.anchor)
+            for motion, item in zip(motions, items)
+        ]
 
     def queue(
         self,
@@ -287,10 +253,8 @@ class Echo(LearnedSystem):
         objects: Sequence[Sequence[ObjectShape]],
     ) -> EchoQueue:
         """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
-        queue = EchoQueue(self, skeletons, seeds)
-        if self.stride is not None:
-            windows = AveragedWindows if self.sampling.average else Rewindow
-            queue = windows(self, skeletons, seeds, self.stride, self.sampling.rewindow_steps)
+        kind = AveragedWindows if self.sampling.average else Rewindow
+        queue = (EchoQueue if self.stride is None else kind)(self, skeletons, seeds)
         if self.contact_use.guidance is not None:
             queue.guide(pulled_by(skeletons, shapes, objects))
         return queue

@@ -1,12 +1,12 @@
 """ECHO's queue of frames (ECHO §3.3): conditioning enters frame by frame, final outputs leave frame by frame."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -19,6 +19,7 @@ from wearcap.diffusion.observed import residual_weights, with_residuals
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
+from wearcap.runtime.windows import Window, cut
 from wearcap.systems.echo.features import TWIN_CONTACTS, TWIN_POINTS, Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.model import EchoDenoiser
 
@@ -27,6 +28,7 @@ class Conditioning(NamedTuple):
     """Conditioning of frames of several batch items: three tracked points, the active object, and observed values of
     the outputs."""
 
+    timestamps: Float64[Tensor, "batch frame"]
     R_world_point: Float[Tensor, "batch frame point 3 3"]
     t_world_point: Float[Tensor, "batch frame point 3"]
     floor_height: Float[Tensor, "batch frame"]
@@ -51,7 +53,7 @@ class Conditioning(NamedTuple):
 
     def frames(self, part: slice | Tensor) -> "Conditioning":
         """A selection of frames."""
-        return Conditioning(*(field[:, part] for field in self))
+        return cut(self, part)
 
     def mirrored(self, skeleton: Skeleton) -> "Conditioning":
         """The frames mirrored left to right; the object is mirrored along its own y axis, too, so that its pose stays a
@@ -69,6 +71,11 @@ class Conditioning(NamedTuple):
             t_world_object=self.t_world_object * flip,
             contact=self.contact[..., TWIN_CONTACTS],
         )
+
+    @property
+    def T_world_head(self) -> Rigid:
+        """Measured head poses."""
+        return Rigid(self.R_world_point[:, :, 0], self.t_world_point[:, :, 0])
 
     @property
     def points(self) -> ThreePoints:
@@ -119,14 +126,34 @@ class EchoModel:
     """Whether the network was trained on contacts."""
 
 
-class _Sampling(Protocol):
-    """The part of a pipeline's sampling that the queue uses."""
+@dataclass(frozen=True)
+class Sampling:
+    """How frames are denoised; see `diffusion.conveyor.RollingSchedule`."""
 
-    @property
-    def observed_length_scale(self) -> float | None: ...
-
-    @property
-    def mirror_average(self) -> bool: ...
+    context: int = 4
+    """Clean frames kept before the ramp: a pose is final once window - context - 1 more frames have arrived."""
+    per_frame: int = 2
+    """Denoising steps per new frame; with a window of 60 and a context of 4 a frame takes 112 in all (ECHO: 100)."""
+    spacing: float = 2.0
+    eta: float = 0.0
+    step: str = "posterior"
+    lead: float = 0.0
+    """Share by which the contacts' ramp of levels is shorter: they are denoised before body and object (ours)."""
+    observed_length_scale: float | None = 8.0
+    """Length scale (frames) of the Gaussian process by which an observed frame's residual of x̂0 reaches its neighbours (ours); None: not at all."""
+    wrists: float | None = 0.3
+    """Share of its distance from the tracked wrists by which x̂0 approaches them in every step (ours); None: not at all
+    (ECHO)."""
+    rewindow: int | None = None
+    """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor (ECHO)."""
+    rewindow_steps: int | None = None
+    """Denoising steps of such a window: 1 leads to the mean of the plausible motions; None: as many as a frame takes on
+    the conveyor."""
+    average: bool = False
+    """Whether what these windows predict for a frame is averaged (ours; they then advance by no more than half of the window
+    less the context, so that two at least predict each frame), or their overlap is inpainted (ECHO Fig. 3)."""
+    mirror_average: bool = False
+    """Mirror test-time augmentation of averaged windows: the prediction for the mirrored window is averaged in (ours)."""
 
 
 @runtime_checkable
@@ -134,18 +161,21 @@ class Pipeline(Protocol):
     """The part of a pipeline that the queue uses."""
 
     model: EchoModel
-    sampling: "_Sampling"
+    sampling: Sampling
     device: str
 
     @property
     def rolling(self) -> RollingSchedule: ...
+
+    @property
+    def stride(self) -> int | None: ...
 
     def denoiser(
         self, queue: "EchoQueue", conditioning: Conditioning, frame: Rigid
     ) -> tuple[Denoise, list[Correct]]: ...
 
 
-class EchoQueue:
+class EchoQueue(Window[Conditioning]):
     """Frames of several batch items, at most a window of them; each batch item's noise comes from its own seed."""
 
     def __init__(self, pipeline: Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
@@ -153,8 +183,8 @@ class EchoQueue:
         self.size = torch.stack([body_size(skeleton) for skeleton in skeletons])
         self.t_parent_joint = torch.stack([skeleton.t_parent_joint for skeleton in skeletons])[:, None]
         model, self.rolling = pipeline.model, pipeline.rolling
+        super().__init__(self.rolling.window)
         self.conveyor = Conveyor(self.rolling, model.schedule, model.net.sizes, len(seeds))
-        self.conditioning: Conditioning | None = None
         self.guided: Guided | None = None
         """Bodies and objects, for a pipeline with guidance."""
         self._random = [torch.Generator().manual_seed(seed) for seed in seeds]
@@ -166,38 +196,48 @@ class EchoQueue:
 
     @torch.no_grad()
     def push(self, fresh: Conditioning) -> Outputs | None:
-        """Add one frame of every batch item (padding after a batch item's end); returns the frames that became final, if
-        any."""
-        noise = self._noise(1)[:, 0]
-        full = self.conveyor.push(noise)
-        if self.conditioning is not None:
-            fresh = Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
-        self.conditioning = fresh
-        frame = self.pipeline.model.features.canonical(self.conditioning.points)
+        """Add frames of every batch item (padding after a batch item's end); returns those that became final, if any."""
+        parts = list(self._advanced(fresh))
+        return Outputs(*(torch.cat(fields, 1) for fields in zip(*parts))) if parts else None
+
+    def _advanced(self, fresh: Conditioning) -> Iterator[Outputs]:
+        first, count = 0, fresh.valid.shape[1]
+        while first < count:
+            part, first = slice(first, min(first + self._due, count)), first + self._due
+            self.append(fresh.frames(part))
+            if (outputs := self._advance()) is not None:
+                yield outputs
+
+    @property
+    def _due(self) -> int:
+        """Number of new frames that are needed to go on."""
+        return 1
+
+    def _advance(self) -> Outputs | None:
+        """Go on by the newest frame; returns the frame that became final, if any."""
+        conditioning, full = self.frames, self.conveyor.push(self._noise(1)[:, 0])
+        assert conditioning is not None
+        frame = self.pipeline.model.features.canonical(conditioning.points)
         if self.pipeline.model.features.moves and full:
             # The conveyor's frames are re-expressed in the window's new canonical frame.
             assert self._frame is not None
             change = frame.inverse() @ self._frame
-            self.conveyor.x = self._reexpressed(self.conveyor.x, change, self.conveyor.level, self.conditioning)
+            self.conveyor.x = self._reexpressed(self.conveyor.x, change, self.conveyor.level, conditioning)
         self._frame = frame
         count = len(self.conveyor.age)
         noise = self._noise(self.rolling.per_frame * count).unflatten(1, (self.rolling.per_frame, count))
-        observation = self._observation(self.conditioning, frame)
-        denoise, corrections = self.pipeline.denoiser(self, self.conditioning, frame)
-        correct = self._corrected(corrections, self.conditioning, observation)
+        observation = self._observation(conditioning, frame)
+        denoise, corrections = self.pipeline.denoiser(self, conditioning, frame)
+        correct = self._corrected(corrections, conditioning, observation)
         self.conveyor.run(denoise, observation, noise.transpose(0, 1), correct)
-        clean = self.conveyor.clean
-        return self._decoded(self.conveyor.x, slice(clean - 1, clean), frame) if clean else None
+        part = self.finalize(self.rolling.ramp - 1)
+        return self._decoded(self.conveyor.x, part, frame) if part.stop > part.start else None
 
+    @torch.no_grad()
     def run(self, whole: Conditioning) -> Outputs:
         """Outputs of all frames of a batch."""
-        count, pushed, final = whole.valid.shape[1], 0, 0
-        out = None
-        while final < count:
-            outputs = self.push(whole.frames(slice(pushed, pushed + 1)) if pushed < count else self.padding())
-            pushed += 1
-            if outputs is None:
-                continue
+        count, out, final = whole.valid.shape[1], None, 0
+        for outputs in self._all(whole):
             if out is None:  # allocate once: keeping small per-frame tensors fragments memory
                 out = Outputs(*(field.new_empty(len(field), count, *field.shape[2:]) for field in outputs))
             stop = min(final + outputs.t_world_root.shape[1], count)
@@ -207,10 +247,15 @@ class EchoQueue:
         assert out is not None
         return out
 
+    def _all(self, whole: Conditioning) -> Iterator[Outputs]:
+        yield from self._advanced(whole)
+        while self.final < whole.valid.shape[1]:
+            yield from self._advanced(self.padding())
+
     def padding(self) -> Conditioning:
         """A padding frame for all batch items: the last frame repeated as not valid."""
-        assert self.conditioning is not None
-        last = self.conditioning.frames(slice(-1, None))
+        assert self.frames is not None
+        last = self.frames.frames(slice(-1, None))
         return last._replace(valid=torch.zeros_like(last.valid), is_observed=torch.zeros_like(last.is_observed))
 
     def _noise(self, rows: int) -> Float[Tensor, "batch row feature"]:

@@ -6,25 +6,24 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool
 from torch import Tensor
 
-from wearcap.body.skeleton import FEET, Skeleton
+from wearcap.body.skeleton import Skeleton
 from wearcap.diffusion.process import Denoise, sample, step_levels
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion, Recording
 from wearcap.runtime.needs import HEAD, HEIGHT, POINTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
-from wearcap.runtime.windows import batched, cut
+from wearcap.runtime.windows import FinalPoses, batched, cut, over_path
 from wearcap.systems.hmd2.model import Conditions, StepRunner
 from wearcap.systems.hmd2.sensing import MODALITIES, Sensing
 from wearcap.systems.hmd2.windows import DiffusionModel, Frames, Predicted, WindowSampler, blended
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
-from wearcap.tracking.refinement import Measured, Refinement
+from wearcap.tracking.refinement import Refinement
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ class HMD2(LearnedSystem):
                 sampler.push(cut(whole, slice(start, stop)))
         self.predict([sampler for mine in samplers for sampler in mine])
         # 5. anchor the body to the measured head; 6. smooth it and hold its feet
-        return [self._refined(*parts) for parts in zip(paths, frames, samplers)]
+        return [self._refined(*parts) for parts in zip(paths, samplers)]
 
     def sense(self, recording: Recording, path: HeadPath) -> Frames:
         """Steps 2 and 3: the conditions of a whole recording. Raises WearcapError as `Sensing.of` does."""
@@ -252,30 +251,17 @@ class HMD2(LearnedSystem):
             mine = (part[item : item + 1, : sampler.count] for part in (*poses, predicted.noise))
             sampler.predicted = Predicted(*mine)
 
-    def _refined(self, path: HeadPath, frames: Frames, samplers: Sequence[WindowSampler]) -> Motion:
+    def _refined(self, path: HeadPath, samplers: Sequence[WindowSampler]) -> Motion:
         """Steps 5 and 6 of a whole recording."""
-        count = len(path.timestamps)
-        R, contact = torch.eye(3).repeat(count, self.model.features.joints, 1, 1), torch.zeros(count, FEET)
-        for (start, stop), sampler in zip(path.stretches, samplers):
-            final = sampler.take(ended=True)
-            assert final is not None
-            R[start:stop], contact[start:stop] = final.R_parent_joint, final.foot_contact
-        motion = self.motion(path.timestamps, path.skeleton, path.T_world_head, R, contact)
+        final = over_path(path, samplers)
+        motion = self.motion(final, path.skeleton)
         if self.refinement is not None:
-            measured = Measured.of(path.T_world_head, frames.floor_height[0])
-            motion = self.refinement.refined(motion, measured, path.stretches, self.model.fps, anchored=True)
+            motion = self.refinement.refined(motion, final.measured, path.stretches, self.fps, anchored=True)
         if len(path.stretches) == 1:
             return motion
         return anchored_to_head(_bridged(motion, path.stretches), path.T_world_head)
 
-    def motion(
-        self,
-        timestamps: Float64[Tensor, "time"],
-        skeleton: Skeleton,
-        T_world_head: Rigid,
-        R_parent_joint: Float[Tensor, "time joint 3 3"],
-        foot_contact: Float[Tensor, "time foot"],
-    ) -> Motion:
+    def motion(self, final: FinalPoses, skeleton: Skeleton) -> Motion:
         """Step 5: predicted poses as a motion that is anchored to the measured head."""
         settings = {
             "pipeline": "hmd2",
@@ -285,10 +271,7 @@ class HMD2(LearnedSystem):
             "lookahead": str(self.lookahead_frames),
             "refinement": str(self.refinement),
         }
-        contact = foot_contact.repeat_interleave(2, -1) if self.model.features.contacts else None
-        root = torch.zeros(len(timestamps), 3)
-        motion = Motion(timestamps, skeleton, R_parent_joint, root, contact, provenance=settings)
-        return anchored_to_head(motion, T_world_head)
+        return anchored_to_head(final.motion(skeleton, settings, self.model.features.contacts), final.T_world_head)
 
 
 def _bridged(motion: Motion, stretches: tuple[tuple[int, int], ...]) -> Motion:

@@ -60,15 +60,10 @@ class Places:
         points, seen = points[finite], seen[finite]
         self.map.add(points, seen)
         self._new.append(_in_order(points, seen))
-        if len(self.map) <= MANY * self.memory.max_points:
-            return
-        # No frame arrives that would drop distant points: only the newest packets of new ones are kept.
-        kept, count = [], 0
-        while self._new and (not kept or count + len(self._new[-1][0]) <= self.memory.max_points):
-            kept.append(self._new.pop())
-            count += len(kept[-1][0])
-        self._new = kept[::-1]
-        self._begin([_joined(self._tracked)])
+        if len(self.map) > MANY * self.memory.max_points:  # no frame arrives that would drop distant points
+            points, seen = _in_order(*_joined(self._new))
+            newest = slice(-self.memory.max_points, None)
+            self._rebuild(_joined(self._tracked), (points[newest], seen[newest]))
 
     def floor(
         self, timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]
@@ -107,16 +102,15 @@ class Places:
         points, seen = _joined(self._tracked)
         near = (points - t_world_head)[:, :2].norm(dim=-1) <= self.memory.radius_m
         newest = slice(-(self.memory.max_points // 2), None)
-        self._begin([(points[near][newest], seen[near][newest])])
+        self._rebuild((points[near][newest], seen[near][newest]), _joined(self._new))
 
-    def _begin(self, tracked: list[tuple[Tensor, Tensor]]) -> None:
-        """Replace the floor tracker's points by these, and the map by one of these and the new ones."""
-        self.map, self._tracked = VoxelMap(self.grid), tracked
+    def _rebuild(self, tracked: tuple[Tensor, Tensor], new: tuple[Tensor, Tensor]) -> None:
+        """Replace all points by these."""
+        self.map, self._tracked, self._new = VoxelMap(self.grid), [tracked], [new]
         self._floor.forget()
-        for points, seen in [*self._new, *tracked]:
+        self._floor.see(tracked[0])
+        for points, seen in (new, tracked):
             self.map.add(points, seen)
-        for points, _ in tracked:
-            self._floor.see(points)
 
 
 def _in_order(

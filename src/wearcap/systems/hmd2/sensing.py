@@ -1,5 +1,6 @@
 """What one wearer's devices sensed, as HMD²'s conditions: a whole recording at once, or sample by sample."""
 
+from bisect import insort
 from collections.abc import Collection
 
 import torch
@@ -23,30 +24,6 @@ _AT_ONCE = 2048
 """Voxel grids that are encoded at a time."""
 
 
-class Timed:
-    """Values in order of time."""
-
-    def __init__(self):
-        self.times, self.values = torch.zeros(0, dtype=torch.float64), torch.zeros(0)
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    def add(self, time: float, value: Float[Tensor, "*size"]) -> None:
-        """Add a value, after those of the same time; beyond `MAX_WAITING` the oldest are dropped."""
-        at = int(torch.searchsorted(self.times, time, right=True))
-        times, values = self.times.new_tensor([time]), value[None]
-        if len(self):
-            times = torch.cat([self.times[:at], times, self.times[at:]])
-            values = torch.cat([self.values[:at], values, self.values[at:]])
-        self.times, self.values = times[-MAX_WAITING:], values[-MAX_WAITING:]
-
-    def forget(self, time: float) -> None:
-        """Drop the values before the newest one at or before a time."""
-        first = max(0, int(torch.searchsorted(self.times, time + 1e-4, right=True)) - 1)
-        self.times, self.values = self.times[first:], self.values[first:]
-
-
 class Sensing:
     """What was sensed so far and later frames need: points of the surroundings, image embeddings, floor heights."""
 
@@ -58,8 +35,10 @@ class Sensing:
         )
         grid = VoxelGrid() if model.place_encoder is None else model.place_encoder.grid
         self.places = Places(grid, stature, model.fps, memory)
-        self.images, self.floors = Timed(), Timed()
-        """The last image used and those not used yet (NaN if refused), and the same of measured floor heights (m)."""
+        self.images: list[tuple[float, Tensor]] = []
+        """Time and embedding (NaN if it was refused) of the last image used, and of those not used yet."""
+        self.floors: list[tuple[float, float]] = []
+        """Time and floor height (m) of the last measurement used, and of those not used yet."""
 
     @classmethod
     def of(cls, model: DiffusionModel, use: Collection[str], recording: Recording, stature: float) -> "Sensing":
@@ -78,7 +57,7 @@ class Sensing:
                 expected = f"{model.net.image_size} of {model.image_encoder!r}, which the network was trained on"
                 fix = "Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points]."
                 raise WearcapError(what, where=recording.name, expected=expected, fix=fix)
-            sensing.images.times, sensing.images.values = camera.timestamps.contiguous(), camera.embedding
+            sensing.images = list(zip(camera.timestamps.tolist(), camera.embedding))
         return sensing
 
     def take(self, sample: HeadSample) -> None:
@@ -87,9 +66,11 @@ class Sensing:
             seen = torch.full((len(sample.points_world),), sample.timestamp, dtype=torch.float64)
             self.places.add(sample.points_world, seen)
         if sample.embedding is not None:
-            self.images.add(sample.timestamp, sample.embedding)
+            insort(self.images, (sample.timestamp, sample.embedding), key=lambda image: image[0])
+            del self.images[:-MAX_WAITING]
         if sample.floor_height is not None:
-            self.floors.add(sample.timestamp, torch.tensor(sample.floor_height))
+            insort(self.floors, (sample.timestamp, sample.floor_height))
+            del self.floors[:-MAX_WAITING]
 
     def frames(
         self,
@@ -105,21 +86,23 @@ class Sensing:
         net, count, last_s = self.model.net, len(timestamps), timestamps[-1].item()
         if floor_height is None:
             floor_height = self.places.floor(timestamps, T_world_head.t)
-            if len(self.floors):
-                floor_height = interpolate_clamped(self.floors.times, self.floors.values, timestamps)
-                self.floors.forget(last_s)
+            if self.floors:
+                measured, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
+                floor_height = interpolate_clamped(measured, height.float(), timestamps)
+                self.floors = self.floors[_newest(measured, last_s) :]
         points, points_valid = torch.zeros(count, net.points_size), torch.zeros(count, dtype=torch.bool)
         if self.places.mapped and (encoder := self.model.place_encoder) is not None:  # what had been seen by each frame
             grids = self.places.map.voxelize(T_world_device, timestamps)
             points = torch.cat([encoder.encode(part) for part in grids.split(_AT_ONCE)])
             points_valid = torch.ones(count, dtype=torch.bool)
         image, image_valid = torch.zeros(count, net.image_size), torch.zeros(count, dtype=torch.bool)
-        if len(self.images):
-            number, image_valid = latest_before(self.images.times, timestamps)
-            image = self.images.values[number].float()
+        if self.images:
+            shown = torch.tensor([time for time, _ in self.images], dtype=torch.float64)
+            number, image_valid = latest_before(shown, timestamps)
+            image = torch.stack([self.images[k][1] for k in number.tolist()]).float()
             image_valid &= image.isfinite().all(-1)
             image = image.nan_to_num(0.0, 0.0, 0.0)
-            self.images.forget(last_s)
+            self.images = self.images[_newest(shown, last_s) :]
         valid = torch.ones(count, dtype=torch.bool)
         fields = (
             timestamps,
@@ -133,3 +116,8 @@ class Sensing:
             valid,
         )
         return Frames(*(field[None] for field in fields))
+
+
+def _newest(times: Float64[Tensor, "sample"], time: float) -> int:
+    """Index of the newest sample at or before a time, or 0."""
+    return max(0, int(torch.searchsorted(times, time + 1e-4, right=True)) - 1)

@@ -17,7 +17,7 @@ from wearcap.runtime.session import HeadStream, Session
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors import packets
-from wearcap.sensors.packets import Admitted, time_fault
+from wearcap.sensors.packets import time_fault
 from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
@@ -39,10 +39,6 @@ class HMD2Stream(HeadStream):
         self.sampler: WindowSampler | None = None
         self._motions: list[Motion] = []
         """Final frames that were not returned yet."""
-
-    def _restart(self, admitted: Admitted) -> None:
-        super()._restart(admitted)
-        self._begin()
 
     def take(self, sample: Any) -> None:
         if isinstance(sample, HeadSample):
@@ -87,14 +83,8 @@ class HMD2Stream(HeadStream):
         return self.sampler
 
     def emit(self, ended: bool = False) -> None:
-        """Make motion of the frames that became final; `ended`: all that are left of a stretch."""
-        if self.sampler is not None and (final := self.sampler.take(ended)) is not None:
-            motion = self.pipeline.motion(
-                final.timestamps, self.wearer.skeleton, final.T_world_head, final.R_parent_joint, final.foot_contact
-            )
-            self._motions += self._refined(motion, final.measured)
-        if ended:
-            self._motions += self._refined_rest()
+        """Make motion of the frames that became final; `ended`: of all that are left of a stretch."""
+        self._motions += self._emitted(self.sampler, ended)
 
     def _final(self, ended: bool) -> Motion | None:
         run([self], ended)
@@ -163,7 +153,7 @@ class HMD2Session(Session):
     def poses(self, ended: bool = False) -> list[Motion | None]:
         for stream in self.streams if ended else ():
             stream.end()
-        run([stream for stream in self.streams if not stream.behind], ended)
+        run([stream for stream in self.streams if not stream.finished], ended)
         return super().poses(ended)
 
 

@@ -16,12 +16,10 @@ from torch import Tensor
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.features import body_size
 from wearcap.diffusion.schedule import Schedule
-from wearcap.geometry.rigid import Rigid
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.runtime.windows import StretchWindows, appended, cut
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
-from wearcap.tracking.refinement import Measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,28 +61,7 @@ class Predicted(NamedTuple):
     """Noise of every sampling step."""
 
 
-class Final(NamedTuple):
-    """Frames that later windows no longer change: poses, head and floor."""
-
-    timestamps: Float64[Tensor, "time"]
-    R_parent_joint: Float[Tensor, "time joint 3 3"]
-    foot_contact: Float[Tensor, "time foot"]
-    R_world_head: Float[Tensor, "time 3 3"]
-    t_world_head: Float[Tensor, "time 3"]
-    floor_height: Float[Tensor, "time"]
-
-    @property
-    def T_world_head(self) -> Rigid:
-        """Head poses."""
-        return Rigid(self.R_world_head, self.t_world_head)
-
-    @property
-    def measured(self) -> Measured:
-        """What refinement knows of these frames."""
-        return Measured.of(self.T_world_head, self.floor_height)
-
-
-class WindowSampler(StretchWindows[Frames, Final]):
+class WindowSampler(StretchWindows[Frames]):
     """Samples the windows of one batch item; memory is bounded by the window and the frames that wait.
 
     The first windows grow: they contain the frames so far, left-aligned, and the remaining frames are masked.
@@ -123,11 +100,9 @@ class WindowSampler(StretchWindows[Frames, Final]):
         # Frames after a recording's end are not valid and never output.
         return super().finalize(lookahead + int((~self.frames.valid).sum()))
 
-    def _made(self, part: slice) -> Final:
-        frames = self.frames
-        assert frames is not None
-        fields = frames.timestamps, *self.predicted[:2], frames.R_world_head, frames.t_world_head, frames.floor_height
-        return Final(*(field[0, part] for field in fields))
+    def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor]:
+        R = self.predicted.R_parent_joint[0, part]
+        return R, torch.zeros(len(R), 3), self.predicted.foot_contact[0, part]
 
 
 def blended(

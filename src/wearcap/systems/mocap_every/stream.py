@@ -20,14 +20,12 @@ from wearcap.recording.timing import joined
 from wearcap.runtime.session import HeadAndWristsStream, Session
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors import packets
-from wearcap.sensors.packets import Admitted
 from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, filtered
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.windows import EstimatorWindows
 from wearcap.tracking.head_path import Chunk
-from wearcap.tracking.refinement import Measured
 
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
@@ -41,7 +39,7 @@ class MocapEveryStream(HeadAndWristsStream):
     """
 
     def __init__(self, pipeline: MocapEvery, wearer: Wearer):
-        super().__init__(pipeline, wearer, pipeline.stride)
+        super().__init__(pipeline, wearer, pipeline.stride, needs_s=(FILTER // 2 + 0.5) / pipeline.fps)
         self._begin()
 
     def _begin(self) -> None:
@@ -49,10 +47,6 @@ class MocapEveryStream(HeadAndWristsStream):
         self._begin_s = 0.0
         self._points: list[tuple[float, Tensor]] = []
         """Points (m) that no windows have yet, and the times (s) they were first seen."""
-
-    def _restart(self, admitted: Admitted) -> None:
-        super()._restart(admitted)
-        self._begin()
 
     def _accept(self, sample: HeadSample) -> None:
         super()._accept(sample)
@@ -97,21 +91,15 @@ class MocapEveryStream(HeadAndWristsStream):
             last = (self._chunks or [chunk])[-1]
             motions += self._advance(chunk, last.timestamps[-1].item() if ended else math.inf)
         if ended:
-            motions += self._emit(ended)
+            motions += self._emitted(self._windows, ended)
             self._windows = None
         return joined(motions)
-
-    def _complete(self, chunk: Chunk) -> bool:
-        """Whether both watches have delivered all samples that a chunk needs, or are silent."""
-        last = chunk.timestamps[-1].item()
-        needed = last + (FILTER // 2 + 0.5) / self.pipeline.model.fps
-        return self._wrists.arrived(needed, last, self._track.newest, MAX_GAP_S)
 
     def _advance(self, chunk: Chunk, end_s: float) -> list[Motion]:
         """Run the windows over one chunk of frames; `end_s`: time of the last frame (s), once known."""
         motions, skeleton, T_world_head = [], self.wearer.skeleton, self._head_of(chunk.T_world_device)
         if chunk.begins or self._windows is None:
-            motions += self._emit(ended=True)
+            motions += self._emitted(self._windows, ended=True)
             self._begin_s = chunk.timestamps[0].item()
             floor_m = self.wearer.floor_m if self._windows is None else self._windows.floor_m
             if floor_m is None:
@@ -125,7 +113,7 @@ class MocapEveryStream(HeadAndWristsStream):
         R, acc = self._watches(chunk, end_s)
         sensed = Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))
         self._windows.push(chunk.timestamps, sensed)
-        return motions + self._emit()
+        return motions + self._emitted(self._windows)
 
     def _watches(
         self, chunk: Chunk, end_s: float
@@ -144,28 +132,13 @@ class MocapEveryStream(HeadAndWristsStream):
                 samples = [WatchSample(time_s, R, torch.zeros(3)) for time_s in ends_s]
             elif len(samples) == 1:
                 samples = [samples[0]._replace(timestamp=samples[0].timestamp - step), *samples]
-            streams.append(
-                ImuStream(
-                    torch.tensor([s.timestamp for s in samples], dtype=torch.float64),
-                    joint,
-                    torch.stack([s.R_world_imu for s in samples]),
-                    torch.stack([s.acc_world for s in samples]),
-                    R_joint_imu=self.wearer.R_wrist_imu.get(joint),
-                )
-            )
+            times, R, acc, _ = zip(*samples)
+            times, mount = torch.tensor(times, dtype=torch.float64), self.wearer.R_wrist_imu.get(joint)
+            streams.append(ImuStream(times, joint, torch.stack(R), torch.stack(acc), R_joint_imu=mount))
             oldest_s = around[-FILTER].item() - 2 * step
             kept = self._wrists.samples[joint]
             self._wrists.samples[joint] = [s for s in kept if s.timestamp >= oldest_s] or kept[-1:]
         return filtered(streams, chunk.timestamps, around, step)
-
-    def _emit(self, ended: bool = False) -> list[Motion]:
-        """Motion of the frames that became final; `ended`: of all that are left of a stretch."""
-        motions: list[Motion] = []
-        if self._windows is not None and (final := self._windows.take(ended)) is not None:
-            T_world_head = final.T_world_head
-            motion = self.pipeline.motion(final.timestamps, self.wearer.skeleton, T_world_head, final)
-            motions = self._refined(motion, Measured.of(T_world_head, final.floor_height))
-        return motions + self._refined_rest() if ended else motions
 
 
 class MocapEverySession(Session):

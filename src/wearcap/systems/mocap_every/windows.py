@@ -17,7 +17,6 @@ from wearcap.body.skeleton import FOOT_JOINTS, MIRROR, Skeleton
 from wearcap.data.features import body_size
 from wearcap.data.transforms import mirrored_rotations
 from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
 from wearcap.runtime.windows import StretchWindows, moved_on
 from wearcap.scene.floor import FloorFixed, FloorFollower
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures
@@ -34,20 +33,6 @@ class WatchModel:
     """Skeleton for recordings without their own."""
     fps: float
     """Frame rate of the estimator (Hz)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sliding:
-    """How windows are estimated."""
-
-    model: WatchModel
-    estimate: Callable[[Float[Tensor, "batch window feature"]], Estimate]
-    stride: int
-    """Frames by which windows advance."""
-    lookahead: int
-    """Frames that must follow a pose before it is final."""
-    mirror_average: bool
-    """Whether the prediction for the mirrored window is averaged in."""
 
 
 class Frames(NamedTuple):
@@ -68,25 +53,7 @@ class Frames(NamedTuple):
         return Sensed(*self[1:-1])
 
 
-class FinalPoses(NamedTuple):
-    """Poses of frames that later windows no longer change."""
-
-    timestamps: Float64[Tensor, "time"]
-    R_world_head: Float[Tensor, "time 3 3"]
-    t_world_head: Float[Tensor, "time 3"]
-    floor_height: Float[Tensor, "time"]
-    """Floor height (m) that conditioned the estimator."""
-    R_parent_joint: Float[Tensor, "time joint 3 3"]
-    t_world_root: Float[Tensor, "time 3"]
-    contact_prob: Float[Tensor, "time foot"]
-
-    @property
-    def T_world_head(self) -> Rigid:
-        """Head poses."""
-        return Rigid(self.R_world_head, self.t_world_head)
-
-
-class EstimatorWindows(StretchWindows[Frames, FinalPoses]):
+class EstimatorWindows(StretchWindows[Frames]):
     """Sliding windows over one uninterrupted stretch of a recording.
 
     The floor height of new frames is predicted by the floor follower from all earlier windows; the feet of the new
@@ -94,10 +61,21 @@ class EstimatorWindows(StretchWindows[Frames, FinalPoses]):
     decisions of D.2 are delayed by up to `stride` frames.
     """
 
-    def __init__(self, sliding: Sliding, skeleton: Skeleton, floor: FloorFollower):
-        length = sliding.model.net.window
+    def __init__(
+        self,
+        model: WatchModel,
+        estimate: Callable[[Float[Tensor, "batch window feature"]], Estimate],
+        skeleton: Skeleton,
+        floor: FloorFollower,
+        stride: int,
+        lookahead: int,
+        mirror_average: bool,
+    ):
+        """`estimate` runs the network; the other settings are those of `MocapEvery`."""
+        length = model.net.window
         super().__init__(length)
-        self._sliding, self._skeleton, self._floor = sliding, skeleton, floor
+        self._features, self._estimate, self._skeleton, self._floor = model.features, estimate, skeleton, floor
+        self._stride, self._lookahead, self._mirror_average = stride, lookahead, mirror_average
         self._size = body_size(skeleton)[None]
         self._feet = skeleton.indices(*FOOT_JOINTS)
         position = torch.arange(1, length + 1, dtype=torch.float32)
@@ -116,8 +94,8 @@ class EstimatorWindows(StretchWindows[Frames, FinalPoses]):
         self, timestamps: Float64[Tensor, "time"], sensed: Sensed, floor_height: Float[Tensor, "time"] | None = None
     ) -> None:
         """Take in any number of frames; `floor_height` (m): where it is not followed but known."""
-        for first in range(0, len(timestamps), self._sliding.stride):
-            part = slice(first, first + self._sliding.stride)
+        for first in range(0, len(timestamps), self._stride):
+            part = slice(first, first + self._stride)
             if floor_height is not None:
                 self._floor = FloorFixed(floor_height[first].item())
             self._advance(timestamps[part], Sensed(*(field[part] for field in sensed)))
@@ -142,18 +120,18 @@ class EstimatorWindows(StretchWindows[Frames, FinalPoses]):
         self._sum[0, -last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
         R, t, contact = _parts(output[-count:])
         self._floor.follow(contact, forward_kinematics(self._skeleton, R, t).t[:, self._feet])
-        self.emit(self._sliding.lookahead)
+        self.emit(self._lookahead)
 
     def _estimated(self) -> Float[Tensor, "last value"]:
         """Root, 6D rotations and contact of the window's last frames, in the world."""
-        frames, mirrors = self.frames, self._sliding.mirror_average
+        frames, mirrors = self.frames, self._mirror_average
         assert frames is not None
-        features, floor, size, sensed = self._sliding.model.features, frames.floor_height, self._size, frames.sensed
+        features, floor, size, sensed = self._features, frames.floor_height, self._size, frames.sensed
         if mirrors:  # the mirrored window's prediction is mirrored back: no left-right bias
             sensed = Sensed(*(torch.cat(both) for both in zip(sensed, sensed.mirrored())))
             floor, size = floor.expand(2, -1), size.expand(2, -1)
         canonical = features.canonical(sensed, floor)
-        estimated = self._sliding.estimate(features.encode(sensed, floor, size, canonical))
+        estimated = self._estimate(features.encode(sensed, floor, size, canonical))
         R, t = features.decode_motion(estimated.motion.float(), sensed, canonical)
         contact = estimated.contact_logit.float().sigmoid()
         if mirrors:
@@ -168,11 +146,9 @@ class EstimatorWindows(StretchWindows[Frames, FinalPoses]):
         assert self.frames is not None
         return self.frames.floor_height[0, -1].item()
 
-    def _made(self, part: slice) -> FinalPoses:
-        frames, rows = self.frames, self._sum[0, part]
-        assert frames is not None
-        measured = frames.timestamps, frames.R_world_head, frames.t_world_head, frames.floor_height
-        return FinalPoses(*(field[0, part] for field in measured), *_parts(rows[:, :-1] / rows[:, -1:]))
+    def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor]:
+        rows = self._sum[0, part]
+        return _parts(rows[:, :-1] / rows[:, -1:])
 
 
 def _parts(
