@@ -300,8 +300,8 @@ def test_what_was_predicted_before_a_head_pose_was_corrected_does_not_count(coun
     queue, conditioning = counting
     found = []
     for k in range(40):
-        outputs = queue.push(conditioning.frames(slice(k, k + 1)))
-        found += [] if outputs is None else outputs.t_world_root[0, :, 0].tolist()
+        queue.push(conditioning.frames(slice(k, k + 1)))
+        found += [] if (final := queue.take()) is None else final[1].t_world_root[0, :, 0].tolist()
         if k == 14:
             points = queue.frames.t_world_point.clone()
             points[:, 13] += 0.1
@@ -338,8 +338,8 @@ def test_averaged_windows_have_the_latency_of_a_conveyor():
     conditioning = batch_item(echo, scenario_of(recording)).conditioning
     queue, final = echo.queue([echo.model.skeleton], [0], [{}], [[]]), []
     for k in range(30):
-        outputs = queue.push(conditioning.frames(slice(k, k + 1)))
-        final.append(0 if outputs is None else outputs.t_world_root.shape[1])
+        queue.push(conditioning.frames(slice(k, k + 1)))
+        final.append(0 if (found := queue.take()) is None else found[1].t_world_root.shape[1])
         assert queue.frames.valid.shape[1] <= WINDOW
     latest = [first for first, count in zip(torch.tensor(final).cumsum(0).tolist(), final) if count]
     assert set(final) == {0, 1, 3}, "the first window has one frame that is old enough"
@@ -443,7 +443,10 @@ def test_the_latency_is_the_ramp():
         EchoQueue(echo, [echo.model.skeleton], [0]),
         batch_item(echo, scenario_of(recording)).conditioning,
     )
-    given = [queue.push(conditioning.frames(slice(k, k + 1))) is not None for k in range(30)]
+    given = []
+    for k in range(30):
+        queue.push(conditioning.frames(slice(k, k + 1)))
+        given.append(queue.take() is not None)
     assert given == [False] * 7 + [True] * 23
 
 

@@ -163,5 +163,5 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         for track in (motion.object_motion or {}).values():
             assert track.t_world_body.isfinite().all()
     sizes = (session._chunks, session.finished, session._track._poses, *session._wrists.samples.values())
-    assert max(session._waiting, *map(len, sizes)) < 100
+    assert max(session.windows.pending, *map(len, sizes)) < 100
     assert len(session._objects.changes) + len(session._objects.seen) < 300

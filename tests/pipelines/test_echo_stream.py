@@ -334,7 +334,7 @@ def test_a_lost_head_does_not_block_output():
         outputs = session.poses()
         count += 0 if outputs is None else len(outputs)
     assert count >= 30
-    assert session._waiting == 0
+    assert session.windows.pending == 0
     assert session.poses(ended=True) is None
 
 
@@ -357,7 +357,7 @@ def test_a_streams_memory_is_bounded():
                 *(len(part) for part in session._wrists.samples.values()),
                 len(session._objects.changes),
                 len(session._objects.seen),
-                session._waiting,
+                session.windows.pending,
                 len(session._chunks),
             )
         )
@@ -373,8 +373,8 @@ def test_the_floor_follows_from_a_standing_wearer():
     session = EchoStream(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     streamed(session, recording)
     floor = (
-        session._queue.frames.floor_height
-        if session._queue
+        session.windows.frames.floor_height
+        if session.windows
         else session._frame(at(1.0), recording.motion.joint("head")[:1]).floor_height
     )
     assert floor[0, -1].item() == pytest.approx(0.0, abs=0.1)

@@ -231,7 +231,7 @@ def test_poses_that_are_missing_at_a_chunks_end_are_held_and_put_right(pipeline)
     assert len(motion) == 70
     assert torch.allclose(head[38:40], head[37].expand(2, 3), atol=1e-4)
     assert torch.allclose(head[40:], recording.head.T_world_head.t[40:], atol=1e-4)
-    window = session.streams[0].sampler.frames.t_world_head[0]
+    window = session.streams[0].windows.frames.t_world_head[0]
     true = recording.head.T_world_head.t[70 - 60 : 70]
     assert torch.allclose(window[:60], true, atol=2e-4)
 
@@ -309,7 +309,7 @@ def test_a_floor_that_is_given_is_used(pipeline):
     recording = surrounded(40)
     session = HMD2Session(pipeline(), [wearer(recording)], [0])
     stream(session, [moment._replace(floor_height=0.01 * i) for i, moment in enumerate(moments(recording))])
-    assert torch.allclose(session.streams[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5)
+    assert torch.allclose(session.streams[0].windows.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5)
 
 
 def test_points_beyond_the_memory_are_forgotten(pipeline):

@@ -1,7 +1,7 @@
 """Streaming captures: samples go in as devices send them, final poses come out."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from jaxtyping import Float
@@ -10,9 +10,9 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
+from wearcap.recording.timing import joined
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
-from wearcap.runtime.windows import StretchWindows
 from wearcap.sensors.packets import Admitted, HeadInput, WristInput
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample
 from wearcap.tracking.head_path import MAX_GAP_S, Chunk, HeadTrack
@@ -105,8 +105,6 @@ class HeadStream(ABC):
         """`stride`: frames of a chunk of the head's path; `anchored`: whether the head joint is put where it is measured."""
         self.pipeline, self.wearer, self._anchored = pipeline, wearer, anchored
         self._head_input, self._track = HeadInput(), HeadTrack(pipeline.fps, stride)
-        self._refiner: Refiner | None = None
-        """Refines the present stretch."""
         self.finished: list[Motion] = []
         """Final motions with times of a previous clock, not returned yet."""
 
@@ -147,32 +145,54 @@ class HeadStream(ABC):
 
     def _restart(self, admitted: Admitted) -> None:
         """Restart the capture with these packets, perhaps on another clock; counters are kept."""
-        dropped, self._refiner = self._track.dropped, None
+        dropped = self._track.dropped
         self._track = HeadTrack(self._track.fps, self._track.stride)
         self._track.dropped = dropped
         self._begin()
 
-    @abstractmethod
     def _begin(self) -> None:
         """Begin the capture, as a new one does."""
+        self.windows: Any = None
+        """Windows of the present stretch; None: none has begun."""
+        self._refiner: Refiner | None = None
+        """Refines the present stretch."""
+        self._motions: list[Motion] = []
+        """Final frames that were not returned yet."""
 
-    def _refined(self, motion: Motion, measured: Measured) -> list[Motion]:
-        """The next frames of a stretch as the pipeline refines them; its final ones, as a list of at most one motion."""
+    @abstractmethod
+    def _opened(self, chunk: Chunk) -> Any:
+        """Windows for the stretch that begins with a chunk; those of the one before are still there."""
+
+    @abstractmethod
+    def _sensed(self, chunk: Chunk, ended: bool) -> tuple[Any, ...]:
+        """What the windows take in for a chunk; `ended`: no more samples will come."""
+
+    def _push(self, chunk: Chunk, ended: bool) -> None:
+        """Give the windows the next chunk; a stretch begins with new ones."""
+        if chunk.begins or self.windows is None:
+            self.emit(ended=True)
+            self.windows = self._opened(chunk)
+        elif len(chunk.corrected.t):
+            self.windows.correct(self._head_of(chunk.corrected))
+        self.windows.push(*self._sensed(chunk, ended))
+
+    def emit(self, ended: bool = False) -> None:
+        """Make motion of the frames that the windows put out; `ended`: of all that are left of a stretch."""
+        if self.windows is not None:
+            self._take(ended)
+        if ended and self._refiner is not None:
+            self._motions += self._refiner.finish()
+            self._refiner = None
+
+    def _take(self, ended: bool) -> None:
+        if (final := self.windows.take(ended)) is not None:
+            self._refine(self.pipeline.motion(final, self.wearer.skeleton), final.measured)
+
+    def _refine(self, motion: Motion, measured: Measured) -> None:
+        """Take in the next frames of a stretch, as the pipeline refines them."""
         if self._refiner is None:
             self._refiner = Refiner(self.pipeline.refinement, motion.skeleton, self.pipeline.fps, self._anchored)
-        return self._refiner.push(motion, measured)
-
-    def _refined_rest(self) -> list[Motion]:
-        """The frames that wait for refinement at the end of a stretch."""
-        refiner, self._refiner = self._refiner, None
-        return [] if refiner is None else refiner.finish()
-
-    def _emitted(self, windows: StretchWindows[Any] | None, ended: bool = False) -> list[Motion]:
-        """Motion of the frames that a stretch's windows put out; `ended`: of all that are left of it."""
-        motions: list[Motion] = []
-        if windows is not None and (final := windows.take(ended)) is not None:
-            motions = self._refined(self.pipeline.motion(final, self.wearer.skeleton), final.measured)
-        return motions + self._refined_rest() if ended else motions
+        self._motions += self._refiner.push(motion, measured)
 
     def _head_of(self, T_world_device: Rigid) -> Rigid:
         """Poses of the head joint, from those of the device on it."""
@@ -192,9 +212,15 @@ class HeadStream(ABC):
             self.end()
         return self.finished.pop(0) if self.finished else self._final(ended)
 
-    @abstractmethod
     def _final(self, ended: bool) -> Motion | None:
         """Frames on the present clock that became final, or None."""
+        self._advance(ended)
+        motions, self._motions = self._motions, []
+        return joined(motions)
+
+    @abstractmethod
+    def _advance(self, ended: bool) -> None:
+        """Go on as far as the samples reach."""
 
 
 class HeadAndWristsStream(HeadStream):
@@ -221,12 +247,14 @@ class HeadAndWristsStream(HeadStream):
         self._wrists.rejoin(None if admitted.again else admitted.packets[0][0])
         self._chunks = []
 
-    def _ready(self, ended: bool) -> Iterator[Chunk]:
-        """The next chunks for which both wrists have delivered their samples, or are silent."""
+    def _advance(self, ended: bool) -> None:
         while (chunk := self._track.next(ended)) is not None:
             self._chunks.append(chunk)
         while self._chunks:
             last = self._chunks[0].timestamps[-1].item()
             if not (ended or self._wrists.arrived(last + self._needs_s, last, self._track.newest, MAX_GAP_S)):
-                break
-            yield self._chunks.pop(0)
+                return
+            self._push(self._chunks.pop(0), ended)
+            self.emit()
+        if ended or not self._track.inside:
+            self.emit(ended=True)

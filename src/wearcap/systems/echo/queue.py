@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import chain
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -189,16 +190,49 @@ class EchoQueue(Window[Conditioning]):
         """Bodies and objects, for a pipeline with guidance."""
         self._random = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._frame: Rigid | None = None
+        self._padded = 0
+        """Number of padding frames after the last one."""
+        self._final: list[tuple[Conditioning, Outputs]] = []
+        """Final frames that were not taken yet."""
+
+    def correct(self, T_world_head: Rigid) -> None:
+        """Replace the head poses of the newest frames, as far as these are not final."""
+        frames, count = self.frames, min(len(T_world_head.t), self.pending)
+        if frames is not None and count:
+            R, t = frames.R_world_point.clone(), frames.t_world_point.clone()
+            R[0, -count:, 0], t[0, -count:, 0] = T_world_head.R[-count:], T_world_head.t[-count:]
+            self.frames = frames._replace(R_world_point=R, t_world_point=t)
 
     def guide(self, guided: Guided) -> None:
         """Give the queue the bodies and objects that guidance needs."""
         self.guided = guided
 
+    @property
+    def pending(self) -> int:
+        """Number of frames that are not final."""
+        return max(0, self.taken - self._padded - self.final)
+
     @torch.no_grad()
-    def push(self, fresh: Conditioning) -> Outputs | None:
-        """Add frames of every batch item (padding after a batch item's end); returns those that became final, if any."""
-        parts = list(self._advanced(fresh))
-        return Outputs(*(torch.cat(fields, 1) for fields in zip(*parts))) if parts else None
+    def push(self, fresh: Conditioning) -> None:
+        """Add frames of every batch item (padding after a batch item's end)."""
+        self._final += map(self._with_conditioning, self._advanced(fresh))
+
+    @torch.no_grad()
+    def take(self, ended: bool = False) -> tuple[Conditioning, Outputs] | None:
+        """Frames that became final since the last call, or None; `ended`: with all others, as none will follow."""
+        if ended:
+            self._final += map(self._with_conditioning, self._rest())
+        if not self._final:
+            return None
+        given, outputs = zip(*self._final)
+        self._final = []
+        frames, found = (type(parts[0])(*(torch.cat(each, 1) for each in zip(*parts))) for parts in (given, outputs))
+        real = slice(frames.valid.shape[1] - max(0, self.final + self._padded - self.taken))
+        return frames.frames(real), cut(found, real)
+
+    def _with_conditioning(self, outputs: Outputs) -> tuple[Conditioning, Outputs]:
+        assert self.frames is not None
+        return self.frames.frames(slice(self.final_count - outputs.t_world_root.shape[1], self.final_count)), outputs
 
     def _advanced(self, fresh: Conditioning) -> Iterator[Outputs]:
         first, count = 0, fresh.valid.shape[1]
@@ -237,7 +271,7 @@ class EchoQueue(Window[Conditioning]):
     def run(self, whole: Conditioning) -> Outputs:
         """Outputs of all frames of a batch."""
         count, out, final = whole.valid.shape[1], None, 0
-        for outputs in self._all(whole):
+        for outputs in chain(self._advanced(whole), self._rest()):
             if out is None:  # allocate once: keeping small per-frame tensors fragments memory
                 out = Outputs(*(field.new_empty(len(field), count, *field.shape[2:]) for field in outputs))
             stop = min(final + outputs.t_world_root.shape[1], count)
@@ -247,12 +281,13 @@ class EchoQueue(Window[Conditioning]):
         assert out is not None
         return out
 
-    def _all(self, whole: Conditioning) -> Iterator[Outputs]:
-        yield from self._advanced(whole)
-        while self.final < whole.valid.shape[1]:
-            yield from self._advanced(self.padding())
+    def _rest(self) -> Iterator[Outputs]:
+        """Outputs of the frames that are left, once padding follows them."""
+        while self.pending:
+            self._padded += 1
+            yield from self._advanced(self._padding())
 
-    def padding(self) -> Conditioning:
+    def _padding(self) -> Conditioning:
         """A padding frame for all batch items: the last frame repeated as not valid."""
         assert self.frames is not None
         last = self.frames.frames(slice(-1, None))

@@ -18,9 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording import Motion
 from wearcap.recording.active_objects import changes
-from wearcap.recording.timing import joined
 from wearcap.runtime.graphs import undisturbed
 from wearcap.runtime.session import HeadAndWristsStream, Session
 from wearcap.runtime.system import CaptureInput
@@ -59,9 +57,7 @@ class EchoStream(HeadAndWristsStream):
         self._begin()
 
     def _begin(self) -> None:
-        self._queue: EchoQueue | None = None
-        self._waiting = 0
-        """Number of frames in the queue that were not output yet; they are its newest."""
+        super()._begin()
         self._floor = FloorTracker(CARRIED * self.wearer.skeleton.height_of("head"), self.pipeline.fps)
         threshold = self.pipeline.contact_use.static_threshold
         self._static = None if threshold is None else StaticObjects(threshold)
@@ -130,48 +126,26 @@ class EchoStream(HeadAndWristsStream):
 
     def _update(self) -> None:
         """Update the queue's frames that are not final with what is known of objects now."""
-        queue = self._queue
-        if queue is None or queue.frames is None:
+        if (queue := self.windows) is None or queue.frames is None:
             return
         if queue.guided is not None and len(queue.guided[1][0]) < len(self._objects.shapes):
             queue.guide(pulled_by([self.wearer.skeleton], [dict(self.wearer.shape)], [self._objects.shapes]))
-        if self._waiting:
-            fresh = self._objects.updated(queue.frames.frames(slice(-self._waiting, None)))
-            queue.frames = appended(queue.frames.frames(slice(-self._waiting)), fresh)
+        if count := queue.pending:
+            fresh = self._objects.updated(queue.frames.frames(slice(-count, None)))
+            queue.frames = appended(queue.frames.frames(slice(-count)), fresh)
 
-    def _final(self, ended: bool) -> Motion | None:
-        motions: list[Motion] = []
+    def _advance(self, ended: bool) -> None:
         with undisturbed(self.pipeline.runtime == "onnx"):
-            for chunk in self._ready(ended):
-                motions += self._advance(chunk)
-            if ended or not (self._chunks or self._track.inside):
-                motions += self._finish()
-        return joined(motions)
+            super()._advance(ended)
 
-    def _advance(self, chunk: Chunk) -> list[Motion]:
-        motions: list[Motion] = []
-        if chunk.begins or self._queue is None:
-            motions += self._finish()
-            seeds, shapes = [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)]
-            self._queue = self.pipeline.queue([self.wearer.skeleton], seeds, shapes, [self._objects.shapes])
-        elif count := min(len(chunk.corrected.t), self._waiting):
-            frames, head = self._queue.frames, self._head_of(chunk.corrected)[-count:]
-            assert frames is not None
-            R, t = frames.R_world_point.clone(), frames.t_world_point.clone()
-            R[0, -count:, 0], t[0, -count:, 0] = head.R, head.t
-            self._queue.frames = frames._replace(R_world_point=R, t_world_point=t)
+    def _opened(self, chunk: Chunk) -> EchoQueue:
+        seeds, shapes = [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)]
+        return self.pipeline.queue([self.wearer.skeleton], seeds, shapes, [self._objects.shapes])
+
+    def _sensed(self, chunk: Chunk, ended: bool) -> tuple[Conditioning]:
+        if len(chunk.corrected.t):
             self._update()
-        self._waiting += 1
-        frame = self._frame(chunk.timestamps, self._head_of(chunk.T_world_device))
-        return motions + self._emit(self._queue, self._queue.push(frame))
-
-    def _finish(self) -> list[Motion]:
-        """The remaining frames of a stretch that has ended."""
-        motions: list[Motion] = []
-        while self._queue is not None and self._waiting:
-            motions += self._emit(self._queue, self._queue.push(self._queue.padding()))
-        self._queue = None
-        return motions + self._refined_rest()
+        return (self._frame(chunk.timestamps, self._head_of(chunk.T_world_device)),)
 
     def _frame(self, timestamps: Float64[Tensor, "1"], T_world_head: Rigid) -> Conditioning:
         poses, time = [T_world_head], timestamps.item()
@@ -198,22 +172,18 @@ class EchoStream(HeadAndWristsStream):
             floor = self._floor.follow(T_world_head.t)
         return self._objects.frames(timestamps, R, t, floor, len(self.wearer.skeleton))
 
-    def _emit(self, queue: EchoQueue, outputs: Outputs | None) -> list[Motion]:
-        """The motion of frames that became final; those of padding are left out."""
-        if outputs is None or queue.frames is None:
-            return []
-        first, count = queue.final_count - outputs.t_world_root.shape[1], self._waiting
-        frames = queue.frames.frames(slice(first, min(first + count, queue.final_count)))
-        self._waiting -= frames.valid.shape[1]
+    def _take(self, ended: bool) -> None:
+        if (found := self.windows.take(ended)) is None:
+            return
+        frames, outputs = found
         # One piece for each active object, or none
         _, lengths = frames.object_number[0].unique_consecutive(return_counts=True)
-        motions, stop = [], 0
+        stop = 0
         for length in lengths.tolist():
             part, stop = slice(stop, stop + length), stop + length
-            motions += self._emit_frames(frames.frames(part), cut(outputs, part))
-        return motions
+            self._take_piece(frames.frames(part), cut(outputs, part))
 
-    def _emit_frames(self, frames: Conditioning, outputs: Outputs) -> list[Motion]:
+    def _take_piece(self, frames: Conditioning, outputs: Outputs) -> None:
         """The same for successive frames with one active object, or none."""
         times, T_world_head, count = frames.timestamps[0], frames.T_world_head[0], frames.valid.shape[1]
         floor_height, stretches = frames.floor_height[0], ((0, count),)
@@ -225,7 +195,7 @@ class EchoStream(HeadAndWristsStream):
             outputs = Outputs(*(torch.cat(fields, 1) for fields in zip(*static)))
         pipeline, item = self.pipeline, BatchItem(path, frames, self._objects.shapes)
         motion = motion_of(item, outputs, pipeline.anchor, pipeline.settings(), pipeline.model.contacts)
-        return self._refined(motion, measured_of(item))
+        self._refine(motion, measured_of(item))
 
 
 class EchoSession(Session):

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion
-from wearcap.recording.timing import joined
 from wearcap.runtime.session import HeadStream, Session
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
@@ -22,7 +21,8 @@ from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
 from wearcap.systems.hmd2.sensing import Sensing
-from wearcap.systems.hmd2.windows import WindowSampler
+from wearcap.systems.hmd2.windows import Frames, WindowSampler
+from wearcap.tracking.head_path import Chunk
 
 
 class HMD2Stream(HeadStream):
@@ -34,11 +34,9 @@ class HMD2Stream(HeadStream):
         self._begin()
 
     def _begin(self) -> None:
+        super()._begin()
         pipeline, stature = self.pipeline, self.wearer.skeleton.height_of("head")
         self.sensing = Sensing(pipeline.model, pipeline.use, stature, self.memory)
-        self.sampler: WindowSampler | None = None
-        self._motions: list[Motion] = []
-        """Final frames that were not returned yet."""
 
     def take(self, sample: Any) -> None:
         if isinstance(sample, HeadSample):
@@ -68,37 +66,31 @@ class HMD2Stream(HeadStream):
         super()._accept(sample)
         self.sensing.take(sample)
 
-    def advance(self, ended: bool) -> WindowSampler | None:
-        """The windows that can go on with the next chunk of the head's path; None: it is not complete."""
-        chunk = self._track.next(ended)
-        if chunk is None:
-            return None
-        if chunk.begins or self.sampler is None:
-            self.emit(ended=True)
-            self.sampler = self.pipeline.sampler(self.wearer.skeleton, self.seed, chunk.first)
-        elif len(chunk.corrected.t):
-            self.sampler.correct(self._head_of(chunk.corrected))
+    def _opened(self, chunk: Chunk) -> WindowSampler:
+        return self.pipeline.sampler(self.wearer.skeleton, self.seed, chunk.first)
+
+    def _sensed(self, chunk: Chunk, ended: bool) -> tuple[Frames]:
         T_world_head = self._head_of(chunk.T_world_device)
-        self.sampler.push(self.sensing.frames(chunk.timestamps, chunk.T_world_device, T_world_head))
-        return self.sampler
+        return (self.sensing.frames(chunk.timestamps, chunk.T_world_device, T_world_head),)
 
-    def emit(self, ended: bool = False) -> None:
-        """Make motion of the frames that became final; `ended`: of all that are left of a stretch."""
-        self._motions += self._emitted(self.sampler, ended)
+    def sense(self, ended: bool) -> bool:
+        """Give the windows the next chunk of the head's path; False: it is not complete."""
+        chunk = self._track.next(ended)
+        if chunk is not None:
+            self._push(chunk, ended)
+        return chunk is not None
 
-    def _final(self, ended: bool) -> Motion | None:
-        run([self], ended)
-        motions, self._motions = self._motions, []
-        return joined(motions)
+    def _advance(self, ended: bool) -> None:
+        advance([self], ended)
 
 
 @torch.inference_mode()
-def run(streams: Sequence[HMD2Stream], ended: bool) -> None:
+def advance(streams: Sequence[HMD2Stream], ended: bool) -> None:
     """Predict all frames whose chunks are complete; wearers share batches."""
-    while ready := {stream: sampler for stream in streams if (sampler := stream.advance(ended)) is not None}:
+    while ready := [stream for stream in streams if stream.sense(ended)]:
         pipeline = streams[0].pipeline
         with pipeline.undisturbed():
-            pipeline.predict(list(ready.values()))
+            pipeline.predict([stream.windows for stream in ready])
         for stream in ready:
             stream.emit()
     for stream in streams if ended else ():
@@ -153,7 +145,7 @@ class HMD2Session(Session):
     def poses(self, ended: bool = False) -> list[Motion | None]:
         for stream in self.streams if ended else ():
             stream.end()
-        run([stream for stream in self.streams if not stream.finished], ended)
+        advance([stream for stream in self.streams if not stream.finished], ended)
         return super().poses(ended)
 
 

@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
-from wearcap.recording import ImuStream, Motion
-from wearcap.recording.timing import joined
+from wearcap.recording import ImuStream
 from wearcap.runtime.session import HeadAndWristsStream, Session
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors import packets
@@ -43,7 +42,7 @@ class MocapEveryStream(HeadAndWristsStream):
         self._begin()
 
     def _begin(self) -> None:
-        self._windows: EstimatorWindows | None = None
+        super()._begin()
         self._begin_s = 0.0
         self._points: list[tuple[float, Tensor]] = []
         """Points (m) that no windows have yet, and the times (s) they were first seen."""
@@ -84,41 +83,27 @@ class MocapEveryStream(HeadAndWristsStream):
             values = packets.owned(sample.R_world_imu), packets.owned(sample.acc_world)
             self._wrists.add(joint, WatchSample(float(sample.timestamp), *values))
 
-    @torch.inference_mode()
-    def _final(self, ended: bool) -> Motion | None:
-        motions: list[Motion] = []
-        for chunk in self._ready(ended):
-            last = (self._chunks or [chunk])[-1]
-            motions += self._advance(chunk, last.timestamps[-1].item() if ended else math.inf)
-        if ended:
-            motions += self._emitted(self._windows, ended)
-            self._windows = None
-        return joined(motions)
+    def _opened(self, chunk: Chunk) -> EstimatorWindows:
+        self._begin_s, skeleton = chunk.timestamps[0].item(), self.wearer.skeleton
+        floor_m = self.wearer.floor_m if self.windows is None else self.windows.floor_m
+        if floor_m is None:
+            head_m = self._head_of(chunk.T_world_device).t[0, 2].item()
+            floor_m = head_m - self.pipeline.carried * skeleton.height_of("head")
+        return self.pipeline.windows(skeleton, floor_m)
 
-    def _advance(self, chunk: Chunk, end_s: float) -> list[Motion]:
-        """Run the windows over one chunk of frames; `end_s`: time of the last frame (s), once known."""
-        motions, skeleton, T_world_head = [], self.wearer.skeleton, self._head_of(chunk.T_world_device)
-        if chunk.begins or self._windows is None:
-            motions += self._emitted(self._windows, ended=True)
-            self._begin_s = chunk.timestamps[0].item()
-            floor_m = self.wearer.floor_m if self._windows is None else self._windows.floor_m
-            if floor_m is None:
-                floor_m = T_world_head.t[0, 2].item() - self.pipeline.carried * skeleton.height_of("head")
-            self._windows = self.pipeline.windows(skeleton, floor_m)
-        elif len(chunk.corrected.t):
-            self._windows.correct(self._head_of(chunk.corrected))
+    def _sensed(self, chunk: Chunk, ended: bool) -> tuple[Float64[Tensor, "time"], Sensed]:
         for first_seen_s, points in self._points:
-            self._windows.see(points, torch.full((len(points),), first_seen_s, dtype=torch.float64))
+            self.windows.see(points, torch.full((len(points),), first_seen_s, dtype=torch.float64))
         self._points.clear()
-        R, acc = self._watches(chunk, end_s)
-        sensed = Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))
-        self._windows.push(chunk.timestamps, sensed)
-        return motions + self._emitted(self._windows)
+        T_world_head, last = self._head_of(chunk.T_world_device), (self._chunks or [chunk])[-1]
+        R, acc = self._watches(chunk, last.timestamps[-1].item() if ended else math.inf)
+        return chunk.timestamps, Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))
 
     def _watches(
         self, chunk: Chunk, end_s: float
     ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"]]:
-        """Wrist orientations and filtered accelerations of a chunk; the filter ignores times outside the stretch."""
+        """Wrist orientations and filtered accelerations of a chunk; the filter ignores times outside the stretch, whose end
+        (s) is known once no more samples come."""
         step = 1 / self.pipeline.model.fps
         frames = torch.arange(-(FILTER // 2), len(chunk.timestamps) + FILTER // 2, dtype=torch.float64)
         around = (chunk.timestamps[0] + step * frames).clamp(self._begin_s, end_s)

@@ -90,6 +90,7 @@ class EstimatorWindows(StretchWindows[Frames]):
         always = torch.full((len(points_world),), -math.inf, dtype=torch.float64)
         self._points.append((points_world, always if first_seen is None else first_seen))
 
+    @torch.inference_mode()
     def push(
         self, timestamps: Float64[Tensor, "time"], sensed: Sensed, floor_height: Float[Tensor, "time"] | None = None
     ) -> None:
