@@ -185,7 +185,7 @@ def test_what_waits_for_a_lost_head_is_bounded(pipeline, recording, monkeypatch)
         session.watch("left_wrist", [WatchSample(k / 30, torch.eye(3), torch.zeros(3))])
         assert session.poses() is None
     assert len(session._wrists.samples["left_wrist"]) == 50
-    assert sum(len(points) for _, points in session._points) <= 1100
+    assert sum(len(points) for points, _ in session._points) <= 1100
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import MIRROR
@@ -185,14 +185,22 @@ class ActiveObjects:
         active = torch.tensor(numbers)[torch.searchsorted(starts, times + SAME_S, right=True)]
         codes = torch.stack([*(shape.code for shape in self.shapes), self._reader.nothing])
         mirrored = torch.stack([*(shape.code_mirrored for shape in self.shapes), self._reader.nothing])
-        R, t, is_seen = frames.R_world_object.clone(), frames.t_world_object.clone(), torch.zeros_like(active).bool()
+        R, t, is_observed = (
+            part.clone() for part in (frames.R_world_object, frames.t_world_object, frames.is_observed)
+        )
+        is_observed[..., 1] = False
         for number, name in enumerate(names):
-            here, T = self._seen(name, times)
-            here &= active == number
-            R[0, here], t[0, here] = T.R[here], T.t[here]
-            is_seen |= here
-        is_observed = frames.is_observed.clone()
-        is_observed[0, :, 1] = is_seen
+            rows = sorted((row for row in self.seen if row[1] == name), key=lambda row: row[0])
+            if not rows:
+                continue
+            at, _, T = zip(*rows)
+            at = torch.tensor(at, dtype=torch.float64)
+            nearest = nearest_frames(at, times)
+            near = (at[nearest] - times).abs() <= 0.5 / self._reader.features.fps + 1e-6
+            here = near & (active == number)
+            R[0, here] = torch.stack([each.R.float() for each in T])[nearest[here]]
+            t[0, here] = torch.stack([each.t.float() for each in T])[nearest[here]]
+            is_observed[0, here, 1] = True
         return frames._replace(
             has_object=(active != NO_OBJECT)[None],
             object_code=codes[active][None],
@@ -202,15 +210,3 @@ class ActiveObjects:
             t_world_object=t,
             is_observed=is_observed,
         )
-
-    def _seen(self, name: str, times: Float64[Tensor, "time"]) -> tuple[Bool[Tensor, "time"], Rigid]:
-        """Whether an object was observed within half a frame of each time, and its pose nearest in time."""
-        rows = sorted(((at, T) for at, seen, T in self.seen if seen == name), key=lambda row: row[0])
-        if not rows:
-            nowhere = torch.zeros(len(times), dtype=torch.bool)
-            return nowhere, Rigid(torch.zeros(len(times), 3, 3), torch.zeros(len(times), 3))
-        at = torch.tensor([row[0] for row in rows], dtype=torch.float64)
-        nearest = nearest_frames(at, times)
-        R, t = torch.stack([T.R.float() for _, T in rows]), torch.stack([T.t.float() for _, T in rows])
-        near = (at[nearest] - times).abs() <= 0.5 / self._reader.features.fps + 1e-6
-        return near, Rigid(R[nearest], t[nearest])

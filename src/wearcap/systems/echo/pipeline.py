@@ -27,13 +27,44 @@ from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
 from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
-from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Guided, Outputs, Sampling
+from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Guided, Outputs
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
 from wearcap.systems.echo.windows import AveragedWindows, Rewindow
 from wearcap.systems.echo.wrists import Reaching, reaches
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import head_path
 from wearcap.tracking.refinement import Measured, Refinement, refined_over
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How frames are denoised; see `diffusion.conveyor.RollingSchedule`."""
+
+    context: int = 4
+    """Clean frames kept before the ramp: a pose is final once window - context - 1 more frames have arrived."""
+    per_frame: int = 2
+    """Denoising steps per new frame; with a window of 60 and a context of 4 a frame takes 112 in all (ECHO: 100)."""
+    spacing: float = 2.0
+    eta: float = 0.0
+    step: str = "posterior"
+    lead: float = 0.0
+    """Share by which the contacts' ramp of levels is shorter: they are denoised before body and object (ours)."""
+    observed_length_scale: float | None = 8.0
+    """Length scale (frames) of the Gaussian process by which an observed frame's residual of x̂0 reaches its neighbours (ours); None: not at all."""
+    wrists: float | None = 0.3
+    """Share of its distance from the tracked wrists by which x̂0 approaches them in every step (ours); None: not at all
+    (ECHO)."""
+    rewindow: int | None = None
+    """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor (ECHO)."""
+    rewindow_steps: int | None = None
+    """Denoising steps of such a window: 1 leads to the mean of the plausible motions; None: as many as a frame takes on
+    the conveyor."""
+    average: bool = False
+    """Whether what these windows predict for a frame is averaged (ours; they then advance by no more than half of the window
+    less the context, so that two at least predict each frame), or their overlap is inpainted (ECHO Fig. 3)."""
+    mirror_average: bool = False
+    """Mirror test-time augmentation of averaged windows: the prediction for the mirrored window is averaged in (ours)."""
+
 
 MAX_ENVIRONMENTS = 16
 """Most environments that a pipeline keeps in memory."""
@@ -45,7 +76,7 @@ class Echo(LearnedSystem):
     batching does not change results."""
 
     model: EchoModel
-    sampling: Sampling = field(default_factory=Sampling)
+    sampling: Sampling = Sampling()
     contacts: ContactUse = field(default_factory=ContactUse)
     anchor: bool = True
     """Whether the body is anchored to the measured head (ours) or keeps its sampled position (ECHO)."""

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import chain
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -15,7 +15,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.features import body_size
 from wearcap.data.transforms import mirrored_rotations
-from wearcap.diffusion.conveyor import Conveyor, Correct, Denoise, Observation, RollingSchedule
+from wearcap.diffusion.conveyor import Conveyor, Correct, Observation
 from wearcap.diffusion.observed import residual_weights, with_residuals
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
@@ -127,59 +127,11 @@ class EchoModel:
     """Whether the network was trained on contacts."""
 
 
-@dataclass(frozen=True)
-class Sampling:
-    """How frames are denoised; see `diffusion.conveyor.RollingSchedule`."""
-
-    context: int = 4
-    """Clean frames kept before the ramp: a pose is final once window - context - 1 more frames have arrived."""
-    per_frame: int = 2
-    """Denoising steps per new frame; with a window of 60 and a context of 4 a frame takes 112 in all (ECHO: 100)."""
-    spacing: float = 2.0
-    eta: float = 0.0
-    step: str = "posterior"
-    lead: float = 0.0
-    """Share by which the contacts' ramp of levels is shorter: they are denoised before body and object (ours)."""
-    observed_length_scale: float | None = 8.0
-    """Length scale (frames) of the Gaussian process by which an observed frame's residual of x̂0 reaches its neighbours (ours); None: not at all."""
-    wrists: float | None = 0.3
-    """Share of its distance from the tracked wrists by which x̂0 approaches them in every step (ours); None: not at all
-    (ECHO)."""
-    rewindow: int | None = None
-    """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor (ECHO)."""
-    rewindow_steps: int | None = None
-    """Denoising steps of such a window: 1 leads to the mean of the plausible motions; None: as many as a frame takes on
-    the conveyor."""
-    average: bool = False
-    """Whether what these windows predict for a frame is averaged (ours; they then advance by no more than half of the window
-    less the context, so that two at least predict each frame), or their overlap is inpainted (ECHO Fig. 3)."""
-    mirror_average: bool = False
-    """Mirror test-time augmentation of averaged windows: the prediction for the mirrored window is averaged in (ours)."""
-
-
-@runtime_checkable
-class Pipeline(Protocol):
-    """The part of a pipeline that the queue uses."""
-
-    model: EchoModel
-    sampling: Sampling
-    device: str
-
-    @property
-    def rolling(self) -> RollingSchedule: ...
-
-    @property
-    def stride(self) -> int | None: ...
-
-    def denoiser(
-        self, queue: "EchoQueue", conditioning: Conditioning, frame: Rigid
-    ) -> tuple[Denoise, list[Correct]]: ...
-
-
 class EchoQueue(Window[Conditioning]):
     """Frames of several batch items, at most a window of them; each batch item's noise comes from its own seed."""
 
-    def __init__(self, pipeline: Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+    def __init__(self, pipeline: Any, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+        """`pipeline`: an `Echo`, whose network denoises the frames."""
         self.pipeline = pipeline
         self.size = torch.stack([body_size(skeleton) for skeleton in skeletons])
         self.t_parent_joint = torch.stack([skeleton.t_parent_joint for skeleton in skeletons])[:, None]

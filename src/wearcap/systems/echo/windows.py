@@ -3,6 +3,7 @@ left), or averaged (ours)."""
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from wearcap.geometry.rotation import matrix_from_rot6d, rot6d_from_matrix
 from wearcap.runtime.windows import moved_on
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.queue import Conditioning, EchoQueue, Guided, Outputs, Pipeline
+from wearcap.systems.echo.queue import Conditioning, EchoQueue, Guided, Outputs
 
 
 class Rewindow(EchoQueue):
@@ -28,9 +29,8 @@ class Rewindow(EchoQueue):
     of a window as the conveyor's are `per_frame` times `stride` steps.
     """
 
-    def __init__(self, pipeline: Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+    def __init__(self, pipeline: Any, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
         super().__init__(pipeline, skeletons, seeds)
-        assert pipeline.stride is not None
         self.stride, self.steps = pipeline.stride, pipeline.sampling.rewindow_steps or self.rolling.steps
 
     @torch.no_grad()
@@ -95,7 +95,7 @@ class AveragedWindows(Rewindow):
     window counts as much.
     """
 
-    def __init__(self, pipeline: Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+    def __init__(self, pipeline: Any, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
         super().__init__(pipeline, skeletons, seeds)
         self._mirror = pipeline.sampling.mirror_average
         if self._mirror:  # the batch items' mirrored twins follow them

@@ -152,17 +152,14 @@ class HMD2(LearnedSystem):
         recordings = [source.recording for source in sources]
         once = {id(recording): recording for recording in recordings}
         # 1. head path and floor; 2. codes of the points around the body; 3. image embeddings; once for all seeds
-        path_of = {key: head_path(recording, self.model.skeleton, self.model.fps) for key, recording in once.items()}
+        path_of = {key: head_path(recording, self.model.skeleton, self.fps) for key, recording in once.items()}
         sensed = {key: self.sense(recording, path_of[key]) for key, recording in once.items()}
-        paths, frames = zip(*((path_of[id(recording)], sensed[id(recording)]) for recording in recordings))
         # 4. windows of the diffusion model; all stretches of all paths share batches
-        samplers = [
-            [self.sampler(path.skeleton, seed, start) for start, _ in path.stretches]
-            for path, seed in zip(paths, seeds)
-        ]
-        for path, whole, mine in zip(paths, frames, samplers):
-            for (start, stop), sampler in zip(path.stretches, mine):
-                sampler.push(cut(whole, slice(start, stop)))
+        paths, samplers = [path_of[id(recording)] for recording in recordings], []
+        for recording, path, seed in zip(recordings, paths, seeds):
+            samplers.append([self.sampler(path.skeleton, seed, start) for start, _ in path.stretches])
+            for stretch, sampler in zip(path.stretches, samplers[-1]):
+                sampler.push(cut(sensed[id(recording)], slice(*stretch)))
         self.predict([sampler for mine in samplers for sampler in mine])
         # 5. anchor the body to the measured head; 6. smooth it and hold its feet
         return [self._refined(*parts) for parts in zip(paths, samplers)]

@@ -5,7 +5,7 @@ floor uses earlier data only), the poses are the same. Memory is bounded by a wi
 """
 
 from collections.abc import Sequence
-from typing import Any, SupportsFloat
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -54,11 +54,10 @@ class HMD2Stream(HeadStream):
                 embedding = torch.full((size,), torch.nan)  # no image is used until the next valid one
             else:
                 embedding = packets.owned(sample.embedding)
-        floor_m: object = sample.floor_height
+        floor_m = sample.floor_height
         if floor_m is not None and (fault := packets.number_fault(floor_m, packets.MAX_POSITION_M)):
             head.refuse("floor height", fault)
             floor_m = None
-        assert floor_m is None or isinstance(floor_m, SupportsFloat)
         floor_m = None if floor_m is None else float(floor_m)
         return HeadSample(float(sample.timestamp), head.pose(sample.T_world_device), points, embedding, floor_m)
 

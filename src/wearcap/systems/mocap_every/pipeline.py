@@ -23,10 +23,10 @@ from wearcap.runtime.windows import FinalPoses, over_path
 from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
 from wearcap.sensors.watches import FILTER, watch_gaps, watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
-from wearcap.systems.mocap_every.features import Sensed, synthetic_wrists
-from wearcap.systems.mocap_every.model import Estimate
+from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
+from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.visual_cues import VisualCues
-from wearcap.systems.mocap_every.windows import EstimatorWindows, WatchModel
+from wearcap.systems.mocap_every.windows import EstimatorWindows
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import CARRIED, floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
@@ -46,6 +46,18 @@ class CapturedWithFloor:
     """Floor height that conditioned the estimator."""
     edits: list[LatentSolution]
     """Solutions of the editing by visual cues, one per batch of windows."""
+
+
+@dataclass(frozen=True, eq=False)
+class WatchModel:
+    """What a training gives a capture: the estimator, and what it was trained with."""
+
+    net: WatchEstimator
+    features: WatchFeatures
+    skeleton: Skeleton
+    """Skeleton for recordings without their own."""
+    fps: float
+    """Frame rate of the estimator (Hz)."""
 
 
 @dataclass
@@ -187,8 +199,7 @@ class MocapEvery(LearnedSystem):
 
     def windows(self, skeleton: Skeleton, floor_m: float) -> EstimatorWindows:
         """Windows over a stretch that begins at a height of the floor (m), with a follower of the configured kind."""
-        how = self.stride, self.lookahead, self.mirror_average
-        return EstimatorWindows(self.model, self.estimate, skeleton, self._follower(skeleton, floor_m), *how)
+        return EstimatorWindows(self, skeleton, self._follower(skeleton, floor_m))
 
     def motion(self, final: FinalPoses, skeleton: Skeleton) -> Motion:
         """Step 4: estimated poses as a motion, anchored to the measured head."""

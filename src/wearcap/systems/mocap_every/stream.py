@@ -44,16 +44,16 @@ class MocapEveryStream(HeadAndWristsStream):
     def _begin(self) -> None:
         super()._begin()
         self._begin_s = 0.0
-        self._points: list[tuple[float, Tensor]] = []
+        self._points: list[tuple[Tensor, Tensor]] = []
         """Points (m) that no windows have yet, and the times (s) they were first seen."""
 
     def _accept(self, sample: HeadSample) -> None:
         super()._accept(sample)
-        if sample.points_world is not None and len(sample.points_world):
-            self._points.append((sample.timestamp, sample.points_world))
+        if (points := sample.points_world) is not None and len(points):
+            self._points.append((points, torch.full((len(points),), sample.timestamp, dtype=torch.float64)))
         if len(self._points) > 1000:
-            points = torch.cat([points for _, points in self._points])
-            self._points = [(sample.timestamp, points[-MAX_POINTS:])]
+            points, seen = (torch.cat(part)[-MAX_POINTS:] for part in zip(*self._points))
+            self._points = [(points, seen)]
 
     def take(self, sample: Any) -> None:
         """Take in one sample of the head camera or of a watch."""
@@ -92,9 +92,8 @@ class MocapEveryStream(HeadAndWristsStream):
         return self.pipeline.windows(skeleton, floor_m)
 
     def _sensed(self, chunk: Chunk, ended: bool) -> tuple[Float64[Tensor, "time"], Sensed]:
-        for first_seen_s, points in self._points:
-            self.windows.see(points, torch.full((len(points),), first_seen_s, dtype=torch.float64))
-        self._points.clear()
+        self.windows.points += self._points
+        self._points = []
         T_world_head, last = self._head_of(chunk.T_world_device), (self._chunks or [chunk])[-1]
         R, acc = self._watches(chunk, last.timestamps[-1].item() if ended else math.inf)
         return chunk.timestamps, Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))

@@ -4,9 +4,7 @@ Predictions of overlapping windows for the same frame are averaged, with weights
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Float64
@@ -19,20 +17,7 @@ from wearcap.data.transforms import mirrored_rotations
 from wearcap.geometry import rotation
 from wearcap.runtime.windows import StretchWindows, moved_on
 from wearcap.scene.floor import FloorFixed, FloorFollower
-from wearcap.systems.mocap_every.features import Sensed, WatchFeatures
-from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
-
-
-@dataclass(frozen=True, eq=False)
-class WatchModel:
-    """What a training gives a capture: the estimator, and what it was trained with."""
-
-    net: WatchEstimator
-    features: WatchFeatures
-    skeleton: Skeleton
-    """Skeleton for recordings without their own."""
-    fps: float
-    """Frame rate of the estimator (Hz)."""
+from wearcap.systems.mocap_every.features import Sensed
 
 
 class Frames(NamedTuple):
@@ -61,54 +46,44 @@ class EstimatorWindows(StretchWindows[Frames]):
     decisions of D.2 are delayed by up to `stride` frames.
     """
 
-    def __init__(
-        self,
-        model: WatchModel,
-        estimate: Callable[[Float[Tensor, "batch window feature"]], Estimate],
-        skeleton: Skeleton,
-        floor: FloorFollower,
-        stride: int,
-        lookahead: int,
-        mirror_average: bool,
-    ):
-        """`estimate` runs the network; the other settings are those of `MocapEvery`."""
-        length = model.net.window
+    def __init__(self, pipeline: Any, skeleton: Skeleton, floor: FloorFollower):
+        """`pipeline`: a `MocapEvery`."""
+        length = pipeline.model.net.window
         super().__init__(length)
-        self._features, self._estimate, self._skeleton, self._floor = model.features, estimate, skeleton, floor
-        self._stride, self._lookahead, self._mirror_average = stride, lookahead, mirror_average
+        self._pipeline, self._skeleton, self._floor = pipeline, skeleton, floor
         self._size = body_size(skeleton)[None]
         self._feet = skeleton.indices(*FOOT_JOINTS)
         position = torch.arange(1, length + 1, dtype=torch.float32)
         self._weight = torch.minimum(position, length + 1 - position).square()[:, None]
         self._sum = torch.zeros(1, length, 3 + 6 * len(skeleton) + 3)
         """Weighted sums of the predictions for the window's frames (root, rotations, contact), and sums of weights."""
-        self._points: list[tuple[Tensor, Tensor]] = []
+        self.points: list[tuple[Tensor, Tensor]] = []
         """Points (m) that the floor follower does not have yet, and the times (s) they were first seen."""
 
     def see(self, points_world: Float[Tensor, "point 3"], first_seen: Float64[Tensor, "point"] | None) -> None:
         """Take in points of the surroundings (m) and the times (s) they were first seen; None: always."""
         always = torch.full((len(points_world),), -math.inf, dtype=torch.float64)
-        self._points.append((points_world, always if first_seen is None else first_seen))
+        self.points.append((points_world, always if first_seen is None else first_seen))
 
     @torch.inference_mode()
     def push(
         self, timestamps: Float64[Tensor, "time"], sensed: Sensed, floor_height: Float[Tensor, "time"] | None = None
     ) -> None:
         """Take in any number of frames; `floor_height` (m): where it is not followed but known."""
-        for first in range(0, len(timestamps), self._stride):
-            part = slice(first, first + self._stride)
+        for first in range(0, len(timestamps), self._pipeline.stride):
+            part = slice(first, first + self._pipeline.stride)
             if floor_height is not None:
                 self._floor = FloorFixed(floor_height[first].item())
             self._advance(timestamps[part], Sensed(*(field[part] for field in sensed)))
 
     def _advance(self, timestamps: Float64[Tensor, "time"], sensed: Sensed) -> None:
         """Estimate the window that ends with up to `stride` new frames."""
-        parts, self._points, until_s = self._points, [], timestamps[-1].item()
+        parts, self.points, until_s = self.points, [], timestamps[-1].item()
         for points, first_seen in parts:
             if (fresh := first_seen <= until_s).any():
                 self._floor.see(points[fresh])
             if not fresh.all():
-                self._points.append((points[~fresh], first_seen[~fresh]))
+                self.points.append((points[~fresh], first_seen[~fresh]))
         new, length = (timestamps, *sensed), self.length
         if self.frames is None:  # the window before the capture is padded with its first frame
             padding = *(field[:1] for field in new), self._floor.ahead(sensed.t_world_head[:1])
@@ -121,18 +96,18 @@ class EstimatorWindows(StretchWindows[Frames]):
         self._sum[0, -last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
         R, t, contact = _parts(output[-count:])
         self._floor.follow(contact, forward_kinematics(self._skeleton, R, t).t[:, self._feet])
-        self.emit(self._lookahead)
+        self.emit(self._pipeline.lookahead)
 
     def _estimated(self) -> Float[Tensor, "last value"]:
         """Root, 6D rotations and contact of the window's last frames, in the world."""
-        frames, mirrors = self.frames, self._mirror_average
+        frames, mirrors = self.frames, self._pipeline.mirror_average
         assert frames is not None
-        features, floor, size, sensed = self._features, frames.floor_height, self._size, frames.sensed
+        features, floor, size, sensed = self._pipeline.model.features, frames.floor_height, self._size, frames.sensed
         if mirrors:  # the mirrored window's prediction is mirrored back: no left-right bias
             sensed = Sensed(*(torch.cat(both) for both in zip(sensed, sensed.mirrored())))
             floor, size = floor.expand(2, -1), size.expand(2, -1)
         canonical = features.canonical(sensed, floor)
-        estimated = self._estimate(features.encode(sensed, floor, size, canonical))
+        estimated = self._pipeline.estimate(features.encode(sensed, floor, size, canonical))
         R, t = features.decode_motion(estimated.motion.float(), sensed, canonical)
         contact = estimated.contact_logit.float().sigmoid()
         if mirrors:
