@@ -59,9 +59,9 @@ class Places:
         seen = torch.full((len(points),), -math.inf, dtype=torch.float64) if first_seen is None else first_seen
         points, seen = points[finite], seen[finite]
         self.map.add(points, seen)
-        self._new.append(_in_order(points, seen))
+        self._new.append(_joined([(points, seen)]))
         if len(self.map) > MANY * self.memory.max_points:  # no frame arrives that would drop distant points
-            points, seen = _in_order(*_joined(self._new))
+            points, seen = _joined(self._new)
             newest = slice(-self.memory.max_points, None)
             self._rebuild(_joined(self._tracked), (points[newest], seen[newest]))
 
@@ -83,7 +83,7 @@ class Places:
         """Give the tracker the points that were seen by a time."""
         if not self._new:
             return
-        points, seen = _in_order(*_joined(self._new)) if len(self._new) > 1 else self._new[0]
+        points, seen = _joined(self._new) if len(self._new) > 1 else self._new[0]
         count = int(torch.searchsorted(seen, until_s, right=True))
         self._new = [(points[count:], seen[count:])] if count < len(points) else []
         if count:
@@ -113,15 +113,8 @@ class Places:
             self.map.add(points, seen)
 
 
-def _in_order(
-    points: Float[Tensor, "point 3"], seen: Float64[Tensor, "point"]
-) -> tuple[Float[Tensor, "point 3"], Float64[Tensor, "point"]]:
-    seen, order = seen.sort(stable=True)
-    return points[order], seen
-
-
 def _joined(parts: list[tuple[Tensor, Tensor]]) -> tuple[Float[Tensor, "point 3"], Float64[Tensor, "point"]]:
-    if not parts:
-        return torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)
-    points, seen = zip(*parts)
-    return torch.cat(points), torch.cat(seen)
+    """Points and times of several packets, in order of time."""
+    points, seen = zip(*parts) if parts else ((torch.zeros(0, 3),), (torch.zeros(0, dtype=torch.float64),))
+    times, order = torch.cat(seen).sort(stable=True)
+    return torch.cat(points)[order], times

@@ -32,11 +32,6 @@ class Frames(NamedTuple):
     floor_height: Float[Tensor, "1 time"]
     """World z (m), as the estimator is conditioned on it."""
 
-    @property
-    def sensed(self) -> Sensed:
-        """The estimator's inputs."""
-        return Sensed(*self[1:-1])
-
 
 class EstimatorWindows(StretchWindows[Frames]):
     """Sliding windows over one uninterrupted stretch of a recording.
@@ -102,7 +97,12 @@ class EstimatorWindows(StretchWindows[Frames]):
         """Root, 6D rotations and contact of the window's last frames, in the world."""
         frames, mirrors = self.frames, self._pipeline.mirror_average
         assert frames is not None
-        features, floor, size, sensed = self._pipeline.model.features, frames.floor_height, self._size, frames.sensed
+        features, floor, size, sensed = (
+            self._pipeline.model.features,
+            frames.floor_height,
+            self._size,
+            Sensed(*frames[1:-1]),
+        )
         if mirrors:  # the mirrored window's prediction is mirrored back: no left-right bias
             sensed = Sensed(*(torch.cat(both) for both in zip(sensed, sensed.mirrored())))
             floor, size = floor.expand(2, -1), size.expand(2, -1)
