@@ -12,8 +12,10 @@ from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.recording import CameraStream, PointCloud, RecordingStore
+from wearcap.scene.voxels import VoxelGrid
+from wearcap.systems.hmd2.places import EVERYTHING, Places
 from wearcap.systems.hmd2.training_windows import HeadContent
-from wearcap.tracking.floor import floor_from_path, floor_from_points, tracked_floor
+from wearcap.tracking.floor import floor_from_path, floor_from_points
 from wearcap_testing import recording_of, swaying_motion
 
 SIZE = 5
@@ -145,19 +147,26 @@ def test_the_floor_follows_a_storey_from_the_head_and_a_step_from_points():
     assert floor_from_points(None, head, 1.6) is None
 
 
+def tracked(points, seen, time, head) -> torch.Tensor:
+    """The floor below a head, from a whole cloud."""
+    places = Places(VoxelGrid(), 1.6, 60.0, EVERYTHING)
+    places.add(points, seen)
+    return places.floor(time, head)
+
+
 def test_a_tracked_floor_knows_nothing_of_what_comes():
     random = torch.Generator().manual_seed(0)
     time = torch.arange(0, 20, 1 / 60).double()
     head = torch.stack([0.2 * time, 0 * time, 0.3 + 1.6 + 0 * time], -1).float()
     points = torch.rand(9000, 3, generator=random) * torch.tensor([6.0, 3.0, 0.02]) - torch.tensor([1.0, 1.5, -0.29])
     seen = 20 * torch.rand(9000, generator=random).double()
-    whole = tracked_floor(PointCloud(points, None, seen), time, head, 1.6, 60.0)
+    whole = tracked(points, seen, time, head)
     assert (whole - 0.3).abs().max() < 0.02
     early = seen < 10
     until = time < 10
-    first = tracked_floor(PointCloud(points[early], None, seen[early]), time[until], head[until], 1.6, 60.0)
+    first = tracked(points[early], seen[early], time[until], head[until])
     assert torch.equal(whole[until], first)
-    blind = tracked_floor(None, time, head + torch.tensor([0.0, 0.0, 0.1]), 1.6, 60.0)
+    blind = tracked(points[:0], seen[:0], time, head + torch.tensor([0.0, 0.0, 0.1]))
     assert (blind - 0.4).abs().max() < 1e-3
 
 

@@ -144,21 +144,22 @@ def knowing(frame: str, **settings) -> Echo:
 
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize(
-    ("make", "step"),
+    ("kind", "settings"),
     [
-        (EchoQueue, "posterior"),
-        (EchoQueue, "redraw"),
-        (lambda *given: Rewindow(*given, stride=3), "posterior"),
-        (lambda *given: AveragedWindows(*given, stride=3), "posterior"),
+        (EchoQueue, {}),
+        (EchoQueue, {"step": "redraw"}),
+        (Rewindow, {"rewindow": 3}),
+        (AveragedWindows, {"rewindow": 3, "average": True}),
     ],
 )
-def test_a_perfect_denoiser_gives_the_ground_truth_in_any_frame(frame, make, step):
+def test_a_perfect_denoiser_gives_the_ground_truth_in_any_frame(frame, kind, settings):
     """Clean frames stay the ground truth while the window's frame of reference moves."""
     recording = carrying(1.0, carried=TWO)
-    echo = knowing(frame, step=step)
+    echo = knowing(frame, **settings)
     conditioning = batch_item(echo, scenario_of(recording, TWO, observed=everything(recording))).conditioning
     conditioning = conditioning._replace(is_observed=torch.zeros_like(conditioning.is_observed))
-    queue = make(echo, [echo.model.skeleton], [0])
+    queue = echo.queue([echo.model.skeleton], [0], [{}], [[]])
+    assert type(queue) is kind
     queue.seen = []
     outputs = queue.run(conditioning)
     torch.testing.assert_close(outputs.t_world_root, conditioning.t_world_root, atol=2e-4, rtol=0)
@@ -174,19 +175,19 @@ def test_noised_frames_are_re_expressed_when_the_window_advances():
     echo = drawn_echo("window")
     queue, recording = EchoQueue(echo, [echo.model.skeleton], [0]), carrying(1.6)
     conditioning = batch_item(echo, scenario_of(recording, margin_s=5.0, observed=everything(recording))).conditioning
-    before, queue.conditioning = (conditioning.frames(slice(0, WINDOW)), conditioning.frames(slice(5, 5 + WINDOW)))
-    old, new = (echo.model.features.canonical(part.points) for part in (before, queue.conditioning))
+    before, queue.frames = (conditioning.frames(slice(0, WINDOW)), conditioning.frames(slice(5, 5 + WINDOW)))
+    old, new = (echo.model.features.canonical(part.points) for part in (before, queue.frames))
     queue.conveyor.age = torch.arange(WINDOW).flip(0)
     queue.conveyor.level = torch.rand(1, WINDOW, 3)
     level = echo.model.net.per_feature(queue.conveyor.level)
     noise = torch.randn(1, WINDOW, sum(echo.model.net.sizes))
-    queue.conveyor.x = add_noise(truth_of(echo, queue.conditioning, old), noise, level, echo.model.schedule)
+    queue.conveyor.x = add_noise(truth_of(echo, queue.frames, old), noise, level, echo.model.schedule)
     turned, change = noise.clone(), new.R.mT @ old.R
     first = echo.model.net.sizes[0]
     for at in (0, 3, 6, first, first + 3, first + 6):
         turned[..., at : at + 3] = (change @ noise[..., at : at + 3, None])[..., 0]
-    expected = add_noise(truth_of(echo, queue.conditioning, new), turned, level, echo.model.schedule)
-    found = queue._reexpressed(queue.conveyor.x, new.inverse() @ old, queue.conveyor.level, queue.conditioning)
+    expected = add_noise(truth_of(echo, queue.frames, new), turned, level, echo.model.schedule)
+    found = queue._reexpressed(queue.conveyor.x, new.inverse() @ old, queue.conveyor.level, queue.frames)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     assert (new.t - old.t).norm() > 0.1
 
@@ -299,12 +300,12 @@ def test_what_was_predicted_before_a_head_pose_was_corrected_does_not_count(coun
     queue, conditioning = counting
     found = []
     for k in range(40):
-        outputs = queue.push(conditioning.frames(slice(k, k + 1)))
-        found += [] if outputs is None else outputs.t_world_root[0, :, 0].tolist()
+        queue.push(conditioning.frames(slice(k, k + 1)))
+        found += [] if (final := queue.take()) is None else final[1].t_world_root[0, :, 0].tolist()
         if k == 14:
-            points = queue.conditioning.t_world_point.clone()
+            points = queue.frames.t_world_point.clone()
             points[:, 13] += 0.1
-            queue.conditioning = queue.conditioning._replace(t_world_point=points)
+            queue.frames = queue.frames._replace(t_world_point=points)
     assert found[13] == pytest.approx((5**2 * 5 + 8**2 * 6) / (5**2 + 8**2), abs=1e-4)
     assert found[12] < 5.5, "windows before count for its neighbours"
 
@@ -337,9 +338,9 @@ def test_averaged_windows_have_the_latency_of_a_conveyor():
     conditioning = batch_item(echo, scenario_of(recording)).conditioning
     queue, final = echo.queue([echo.model.skeleton], [0], [{}], [[]]), []
     for k in range(30):
-        outputs = queue.push(conditioning.frames(slice(k, k + 1)))
-        final.append(0 if outputs is None else outputs.t_world_root.shape[1])
-        assert queue.conditioning.valid.shape[1] <= WINDOW
+        queue.push(conditioning.frames(slice(k, k + 1)))
+        final.append(0 if (found := queue.take()) is None else found[1].t_world_root.shape[1])
+        assert queue.frames.valid.shape[1] <= WINDOW
     latest = [first for first, count in zip(torch.tensor(final).cumsum(0).tolist(), final) if count]
     assert set(final) == {0, 1, 3}, "the first window has one frame that is old enough"
     assert latest == [k + 1 - (8 - 3) for k, count in enumerate(final) if count]
@@ -442,7 +443,10 @@ def test_the_latency_is_the_ramp():
         EchoQueue(echo, [echo.model.skeleton], [0]),
         batch_item(echo, scenario_of(recording)).conditioning,
     )
-    given = [queue.push(conditioning.frames(slice(k, k + 1))) is not None for k in range(30)]
+    given = []
+    for k in range(30):
+        queue.push(conditioning.frames(slice(k, k + 1)))
+        given.append(queue.take() is not None)
     assert given == [False] * 7 + [True] * 23
 
 
@@ -454,7 +458,7 @@ def test_a_queues_memory_is_bounded():
     )
     for k in range(60):
         queue.push(conditioning.frames(slice(k, k + 1)))
-        assert queue.conditioning.valid.shape[1] == queue.conveyor.x.shape[1] <= WINDOW
+        assert queue.frames.valid.shape[1] == queue.conveyor.x.shape[1] <= WINDOW
 
 
 def test_acts_may_be_listed():

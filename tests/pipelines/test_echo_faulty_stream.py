@@ -135,8 +135,8 @@ def test_what_waits_for_a_lost_head_is_bounded(echo, recording, monkeypatch):
         session.activate("box_1" if k % 2 else None, k / 30)
         session.see_object("box_1", k / 30, pose)
         assert session.poses() is None
-    assert len(session._wrists.samples["left_wrist"]) == len(session._activated) == 50
-    assert len(session._seen) == 20
+    assert len(session._wrists.samples["left_wrist"]) == len(session._objects.changes) == 50
+    assert len(session._objects.seen) == 20
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -162,12 +162,6 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         assert motion.t_world_root.isfinite().all()
         for track in (motion.object_motion or {}).values():
             assert track.t_world_body.isfinite().all()
-    sizes = (
-        session._chunks,
-        session._finished,
-        session._track._poses,
-        session._pending,
-        *session._wrists.samples.values(),
-    )
-    assert max(map(len, sizes)) < 100
-    assert len(session._activated) + len(session._seen) < 300
+    sizes = (session._chunks, session.finished, session._track._poses, *session._wrists.samples.values())
+    assert max(session.windows.pending, *map(len, sizes)) < 100
+    assert len(session._objects.changes) + len(session._objects.seen) < 300

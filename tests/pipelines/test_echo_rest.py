@@ -34,6 +34,7 @@ def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Conditioning, Out
     observed_parts = torch.zeros(1, count, 3, dtype=torch.bool)
     observed_parts[0, list(observed), 1] = True
     conditioning = Conditioning(
+        torch.arange(count, dtype=torch.float64)[None] / 30,
         eye[:, :, None].repeat(1, 1, 3, 1, 1),
         zeros[:, :, None].repeat(1, 1, 3, 1),
         zeros[..., 0],

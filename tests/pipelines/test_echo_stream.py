@@ -334,7 +334,7 @@ def test_a_lost_head_does_not_block_output():
         outputs = session.poses()
         count += 0 if outputs is None else len(outputs)
     assert count >= 30
-    assert session._pending == []
+    assert session.windows.pending == 0
     assert session.poses(ended=True) is None
 
 
@@ -355,13 +355,17 @@ def test_a_streams_memory_is_bounded():
         sizes.append(
             (
                 *(len(part) for part in session._wrists.samples.values()),
-                len(session._activated),
-                len(session._seen),
-                len(session._pending),
+                len(session._objects.changes),
+                len(session._objects.seen),
+                session.windows.pending,
                 len(session._chunks),
             )
         )
     assert sizes[3] == sizes[1]
+
+
+def at(time_s: float) -> torch.Tensor:
+    return torch.tensor([time_s], dtype=torch.float64)
 
 
 def test_the_floor_follows_from_a_standing_wearer():
@@ -369,9 +373,9 @@ def test_the_floor_follows_from_a_standing_wearer():
     session = EchoStream(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     streamed(session, recording)
     floor = (
-        session._queue.conditioning.floor_height
-        if session._queue
-        else session._frame(1.0, recording.motion.joint("head")[:1]).floor_height
+        session.windows.frames.floor_height
+        if session.windows
+        else session._frame(at(1.0), recording.motion.joint("head")[:1]).floor_height
     )
     assert floor[0, -1].item() == pytest.approx(0.0, abs=0.1)
 
@@ -380,8 +384,8 @@ def test_the_floor_is_found_after_sitting_and_standing_up():
     recording = carrying(0.6)
     session = EchoStream(drawn_echo(), wearer(recording, floor_m=None), seed=0)
     head, low = recording.motion.joint("head")[:1], torch.tensor([0.0, 0.0, 0.5])
-    sitting = [session._frame(k / 30, Rigid(head.R, head.t - low)).floor_height.item() for k in range(30)]
-    standing = [session._frame(1 + k / 30, head).floor_height.item() for k in range(60)]
+    sitting = [session._frame(at(k / 30), Rigid(head.R, head.t - low)).floor_height.item() for k in range(30)]
+    standing = [session._frame(at(1 + k / 30), head).floor_height.item() for k in range(60)]
     assert sitting == pytest.approx([standing[-1] - 0.5] * 30, abs=1e-3)
     carried_m = HEAD_CARRIED * recording.skeleton.height_of("head")
     assert standing[-1] == pytest.approx(head.t[0, 2].item() - carried_m, abs=1e-3)

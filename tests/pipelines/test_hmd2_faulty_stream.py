@@ -11,7 +11,7 @@ from small_hmd2 import hmd2_of
 from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import Motion
-from wearcap.systems.hmd2 import wearer as hmd2_wearer
+from wearcap.systems.hmd2 import sensing
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.places import Memory
@@ -157,13 +157,14 @@ def _joined(parts: list[Motion], count: int) -> dict[str, torch.Tensor]:
 
 
 def test_what_waits_for_a_lost_head_is_bounded(hmd2, recording, monkeypatch):
-    monkeypatch.setattr(hmd2_wearer, "MAX_WAITING", 30)
+    monkeypatch.setattr(sensing, "MAX_WAITING", 30)
     session = HMD2Session(hmd2, [wearer(recording)], [0], Memory(max_points=1000))
     for k in range(200):
         pushed(session, [[HeadSample(k / 60, None, torch.rand(100, 3), torch.zeros(IMAGE), 0.0)]])
-    state = session.streams[0]
-    assert len(state.pictures) == len(state.floors) == 30
-    assert len(state.places.map) == sum(len(points) for points, _ in state.places._new) <= 4000
+    known = session.streams[0].sensing
+    places = known.places
+    assert len(known.images) == len(known.floors) == 30
+    assert len(places.map) == sum(len(points) for points, _ in places._new) <= 4000
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -189,4 +190,4 @@ def test_whatever_comes_it_goes_on(hmd2, recording, seed):
     well = run(session, conditions, 4.0)
     assert max(motion.timestamps[-1].item() for motion in well) > 5.1
     state = session.streams[0]
-    assert len(state.pictures) + len(state.floors) + len(state.track._poses) < 300
+    assert len(state.sensing.images) + len(state.sensing.floors) + len(state._track._poses) < 300

@@ -231,7 +231,7 @@ def test_poses_that_are_missing_at_a_chunks_end_are_held_and_put_right(pipeline)
     assert len(motion) == 70
     assert torch.allclose(head[38:40], head[37].expand(2, 3), atol=1e-4)
     assert torch.allclose(head[40:], recording.head.T_world_head.t[40:], atol=1e-4)
-    window = session.streams[0].sampler.frames.t_world_head[0]
+    window = session.streams[0].windows.frames.t_world_head[0]
     true = recording.head.T_world_head.t[70 - 60 : 70]
     assert torch.allclose(window[:60], true, atol=2e-4)
 
@@ -309,7 +309,7 @@ def test_a_floor_that_is_given_is_used(pipeline):
     recording = surrounded(40)
     session = HMD2Session(pipeline(), [wearer(recording)], [0])
     stream(session, [moment._replace(floor_height=0.01 * i) for i, moment in enumerate(moments(recording))])
-    assert torch.allclose(session.streams[0].sampler.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5)
+    assert torch.allclose(session.streams[0].windows.frames.floor_height[0, :40], 0.01 * torch.arange(40), atol=1e-5)
 
 
 def test_points_beyond_the_memory_are_forgotten(pipeline):
@@ -319,7 +319,7 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
         at = torch.tensor([0.1 * i, 0.0, 1.6])
         points = at + 8 * torch.rand(100, 3, generator=random) - 4
         pushed(session, [[HeadSample(i / 60, Rigid(torch.eye(3), at), points)]])
-    places = session.streams[0].places
+    places = session.streams[0].sensing.places
     kept = torch.cat([points for points, _ in places._tracked + places._new])
     assert len(kept) == len(places.map) <= 2000 + 1000
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
@@ -332,7 +332,7 @@ def test_a_long_stream_needs_no_more_than_a_short_one(pipeline):
     for lap in range(30):
         pushed(session, [[moment._replace(timestamp=moment.timestamp + 2 * lap) for moment in conditions]])
         if lap % 5 == 4:
-            sizes.append(len(pickle.dumps(vars(session.streams[0].places) | vars(session.streams[0].track))))
+            sizes.append(len(pickle.dumps(vars(session.streams[0].sensing.places) | vars(session.streams[0]._track))))
     assert max(sizes[3:]) <= 1.02 * max(sizes[:3])
 
 

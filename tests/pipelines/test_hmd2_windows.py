@@ -5,7 +5,8 @@ import torch
 from test_hmd2 import pipeline, seeing_recording
 
 from wearcap.errors import WearcapError
-from wearcap.systems.hmd2.windows import Frames, advance, blended
+from wearcap.runtime.windows import cut
+from wearcap.systems.hmd2.windows import blended
 from wearcap.tracking.head_path import head_path
 
 
@@ -28,40 +29,41 @@ def test_new_frames_continue_from_observed_ones_and_fade_into_the_prediction():
     assert torch.equal(step, torch.where(is_observed[..., None], observed, x0_hat))
 
 
-def windows(hmd2, frames: int, stride: int):
+def windows(hmd2, frames: int):
     """The sampler of a recording, window after window."""
     recording = seeing_recording(frames)
     path = head_path(recording, hmd2.model.skeleton, hmd2.model.fps)
     hmd2.prepare()
     conditions, sampler = hmd2.sense(recording, path), hmd2.sampler(path.skeleton, 0, 0)
-    for start in range(0, frames, stride):
-        advance([sampler], [Frames(*(part[:, start : start + stride] for part in conditions))])
+    for start in range(0, frames, hmd2.advance):
+        sampler.push(cut(conditions, slice(start, start + hmd2.advance)))
+        hmd2.predict([sampler])
         yield sampler
 
 
 def test_every_window_sees_the_same_noise_at_the_same_moment():
     last = None
-    for sampler in windows(pipeline(), 120, 10):
+    for sampler in windows(pipeline(stride=10, lookahead=20), 120):
         assert sampler.count <= 60
         if last is not None:
             moved = last.shape[1] + 10 - sampler.count
-            assert torch.equal(sampler.noise[:, : last.shape[1] - moved], last[:, moved:])
-        last = sampler.noise
+            assert torch.equal(sampler.predicted.noise[:, : last.shape[1] - moved], last[:, moved:])
+        last = sampler.predicted.noise
     assert last is not None
     assert last.std() == pytest.approx(1.0, abs=0.02)
 
 
 def test_final_poses_stay_and_lookahead_frames_are_re_denoised():
     final_poses, lookahead = [], []
-    for sampler in windows(pipeline(fade=8), 100, 10):
-        poses = sampler.finalize(20)[0].R_parent_joint[0]
+    for sampler in windows(pipeline(fade=8, stride=10, lookahead=20), 100):
+        given, final = sampler.take(), sampler.final_count
+        poses = torch.zeros(0, 23, 3, 3) if given is None else given.R_parent_joint
         if len(poses):
-            final = sampler.final
             assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(poses) : final], poses)
             output = torch.cat([*final_poses, poses])[-final:]
             assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(output) : final], output)
         final_poses.append(poses)
-        lookahead.append(sampler.predicted.R_parent_joint[0, sampler.final :])
+        lookahead.append(sampler.predicted.R_parent_joint[0, final:])
     assert len(torch.cat(final_poses)) == 80
     assert not torch.allclose(lookahead[-2][10:], lookahead[-1][:10], atol=1e-5)
 

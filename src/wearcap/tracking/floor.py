@@ -122,32 +122,3 @@ class FloorTracker:
                 self._height = float(estimate_floor(cloud, path, self.stature).height[-1])
         else:
             self._height = float(np.percentile(self._heights, 90)) - self.stature
-
-
-def tracked_floor(
-    cloud: PointCloud | None,
-    timestamps: Float64[Tensor, "time"],
-    t_world_head: Float[Tensor, "time 3"],
-    stature: float,
-    fps: float,
-) -> Float[Tensor, "time"]:
-    """Floor height (m) below each head position from the data up to that frame, by a `FloorTracker`.
-
-    A cloud without times is used from the first frame on.
-    """
-    tracker = FloorTracker(stature, fps)
-    points, seen = torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)
-    if cloud is not None and cloud.first_seen is None:
-        tracker.see(cloud.points_world)
-    elif cloud is not None and cloud.first_seen is not None:
-        seen, order = cloud.first_seen.sort(stable=True)
-        points = cloud.points_world[order]
-    floor = torch.empty(len(timestamps))
-    taken = 0
-    for start in range(0, len(timestamps), LOOK_FRAMES):
-        until = int(torch.searchsorted(seen, timestamps[start], right=True))
-        if until > taken:
-            tracker.see(points[taken:until])
-            taken = until
-        floor[start : start + LOOK_FRAMES] = tracker.follow(t_world_head[start : start + LOOK_FRAMES])
-    return floor

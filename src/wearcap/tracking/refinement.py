@@ -110,11 +110,12 @@ class Refinement:
 class Refiner:
     """Refines one stretch of motion, piece by piece."""
 
-    def __init__(self, refinement: Refinement, skeleton: Skeleton, fps: float, anchored: bool):
-        """`anchored`: whether the head joint is put where it was measured."""
-        self.refinement, self.fps, self.anchored = refinement, fps, anchored
+    def __init__(self, refinement: Refinement | None, skeleton: Skeleton, fps: float, anchored: bool):
+        """`refinement` None: motion stays as it is. `anchored`: whether the head joint is put where it was measured."""
+        self._refines, self.refinement = refinement is not None, refinement or Refinement(0.0, None, False)
+        self.fps, self.anchored = fps, anchored
         has_soles = all(patch in skeleton.sites for patch in FOOT_PATCHES)
-        self._feet = refinement.feet if has_soles else None
+        self._feet = self.refinement.feet if has_soles else None
         self._values = torch.zeros(0, 0)
         """Values to be averaged: of frames that are smooth already, as far as later ones need them, and of the others."""
         self._raw: tuple[Motion, Measured] | None = None
@@ -128,6 +129,8 @@ class Refiner:
 
         Raises WearcapError for contact probabilities that are not finite.
         """
+        if not self._refines:
+            return [motion]
         if self._feet is not None and motion.contact_prob is not None and not motion.contact_prob.isfinite().all():
             raise WearcapError("contact probabilities that are NaN or infinite", expected="values from 0 to 1")
         values = rotation.rot6d_from_matrix(motion.R_parent_joint).flatten(-2)
@@ -193,8 +196,16 @@ class Refiner:
         return offsets
 
 
-def held_in_gaps(motion: Motion, path: HeadPath, anchored: bool) -> Motion:
-    """The motion whose frames between stretches keep the pose before them, `anchored` at the interpolated head."""
+def refined_over(
+    refinement: Refinement | None, motion: Motion, measured: Measured, path: HeadPath, fps: float, anchored: bool
+) -> Motion:
+    """A motion along a path, refined; frames between stretches keep the pose before them, `anchored` at the interpolated
+    head. None: it stays."""
+    if refinement is None:
+        return motion
+    motion = refinement.refined(motion, measured, path.stretches, fps, anchored)
+    if len(path.stretches) == 1:
+        return motion
     frames = torch.cat([torch.arange(start, stop) for start, stop in path.stretches])[path.held_frames]
     held = replace(motion, R_parent_joint=motion.R_parent_joint[frames], t_world_root=motion.t_world_root[frames])
     return anchored_to_head(held, path.T_world_head) if anchored else held

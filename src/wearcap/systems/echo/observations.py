@@ -1,31 +1,25 @@
 """ECHO's conditioning from a recording at the model's rate: tracked points, floor, active objects, observations."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, WRISTS
-from wearcap.data.objects import object_cloud
+from wearcap.body.skeleton import FOOT_PATCHES, WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, resample
-from wearcap.geometry.triangle_distance import TriangleIndex
-from wearcap.metrics.symmetry import Symmetry
-from wearcap.models.point_encoder import PointNeXt, bounds
-from wearcap.recording.active_objects import NO_OBJECT, ActiveSpan, active_at
+from wearcap.recording.active_objects import ActiveSpan, changes
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import at_times
-from wearcap.scene.objects import Environment, SceneObject
-from wearcap.systems.echo.features import CONTACTS, EchoFeatures
-from wearcap.systems.echo.model import MODALITIES
+from wearcap.scene.objects import Environment
+from wearcap.systems.echo.features import CONTACTS
+from wearcap.systems.echo.objects import ActiveObjects, ObjectReader, ObjectShape
 from wearcap.systems.echo.queue import Conditioning
 from wearcap.tracking.floor import CARRIED
 from wearcap.tracking.head_path import HeadPath
@@ -36,87 +30,6 @@ SAME_S = 1e-4
 """Times closer than this count as equal (s)."""
 SWAPPED_M = 0.02
 """Median distance of the left wrist to the right of the right wrist from which the two count as swapped (m)."""
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectShape:
-    """An object in its own axes, centred on its bounding box; its pose is the pose of this centre."""
-
-    name: str
-    category: str
-    mesh: Mesh
-    middle: Float[Tensor, "3"]
-    """Centre of the bounding box in coordinates of the mesh (m)."""
-    cloud: Float[Tensor, "point 3"]
-    """Surface points relative to the centre (m)."""
-    code: Float[Tensor, "code"]
-    """Condition for the network: class, extents and feature, raw or embedded (`ObjectReader`)."""
-    code_mirrored: Float[Tensor, "code"]
-    """Condition for the object mirrored along its own y axis."""
-    surface: TriangleIndex
-    """Spatial index of the mesh's triangles."""
-    item: SceneObject | None = None
-    """The object in its environment, whose freedom captures keep to; None: it may be anywhere."""
-
-    @cached_property
-    def symmetry(self) -> Symmetry:
-        """Turns that leave the object as it was."""
-        return Symmetry.of(self.mesh, self.cloud + self.middle, self.surface)
-
-    def centred(self, T_world_object: Rigid) -> Rigid:
-        """Pose of the bounding box's centre, given the mesh's pose."""
-        return Rigid(T_world_object.R, T_world_object @ self.middle.to(T_world_object.t))
-
-    def reachable(self, T_world_middle: Rigid) -> Rigid:
-        """The nearest pose of the centre that the object's freedom allows."""
-        if self.item is None:
-            return T_world_middle
-        return self.centred(self.item.reachable(self.of_mesh(T_world_middle), self.middle))
-
-    def of_mesh(self, T_world_middle: Rigid) -> Rigid:
-        """The inverse of `centred`."""
-        return Rigid(T_world_middle.R, T_world_middle @ -self.middle.to(T_world_middle.t))
-
-
-class ObjectReader:
-    """Turns objects into conditions for the network; each mesh is processed once."""
-
-    def __init__(
-        self,
-        features: EchoFeatures,
-        encoder: PointNeXt | None,
-        embed: Callable[[Tensor], Tensor] | None = None,
-        freedoms: bool = False,
-    ):
-        """`freedoms`: whether shapes know how their objects can move. `encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
-        on codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
-        self.features, self.encoder, self._embed, self._freedoms = features, encoder, embed, freedoms
-        empty = torch.zeros(1, features.object_condition_size)
-        self.nothing: Float[Tensor, "code"] = self._embedded(empty)[0]
-        """Placeholder code for frames without an active object."""
-        self._shapes: dict[tuple[int, str], ObjectShape] = {}
-
-    @torch.inference_mode()
-    def __call__(self, item: SceneObject) -> ObjectShape:
-        """Shape and codes of an object. Raises WearcapError for a class that the model was not built for."""
-        key = (id(item.mesh), item.category)
-        if key in self._shapes:
-            return replace(self._shapes[key], name=item.name, item=item if self._freedoms else None)
-        one_hot = self.features.class_code(item.category)
-        cloud = object_cloud(item.mesh)
-        middle = (cloud.max(0).values + cloud.min(0).values) / 2
-        both = torch.stack([cloud - middle, (cloud - middle) * torch.tensor(MIRROR)])
-        parts = [one_hot.expand(2, -1), torch.cat(bounds(both), -1)]
-        if self.encoder is not None and self.features.shape_size:
-            parts.append(self.encoder(both))
-        code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)
-        made = item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored
-        self._shapes[key] = ObjectShape(*made, TriangleIndex.of(item.mesh), item if self._freedoms else None)
-        return self._shapes[key]
-
-    @torch.no_grad()
-    def _embedded(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
-        return (codes if self._embed is None else self._embed(codes)).clone()
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,19 +78,12 @@ def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> B
     """
     recording = scenario.recording
     R, t = _tracked_points(recording, path)
-    names = list(dict.fromkeys(span.object for span in scenario.active_objects))
-    objects = _objects(scenario, names, reader)
-    active = active_at(scenario.active_objects, names, path.timestamps)
-    codes = torch.stack([*(shape.code for shape in objects), reader.nothing])
-    mirrored = torch.stack([*(shape.code_mirrored for shape in objects), reader.nothing])
     floor = path.floor_below(CARRIED)
     if recording.floor is not None:
         floor = interpolate_clamped(recording.floor.timestamps, recording.floor.height, path.timestamps)
-    objects_of_frames = active != NO_OBJECT, codes[active], mirrored[active], active.float()
-    valid = torch.ones(len(path.timestamps), dtype=torch.bool)
-    observed = _observed(scenario, path, names, objects, active)
-    parts = R, t, floor.float(), *objects_of_frames, valid, *observed
-    return BatchItem(path, Conditioning(*(part[None] for part in parts)), objects)
+    objects = _active_objects(scenario, path, reader)
+    frames = objects.frames(path.timestamps, R, t, floor.float(), len(path.skeleton))
+    return BatchItem(path, _with_observed(scenario, path, frames), objects.shapes)
 
 
 def _tracked_points(
@@ -240,67 +146,57 @@ def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, w
         raise WearcapError(f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where, expected=expected)
 
 
-def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list[ObjectShape]:
+def _active_objects(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> ActiveObjects:
+    """Objects of a recording, when they are active, and where they are observed."""
+    objects, where = ActiveObjects(reader, scenario.environment, scenario.placed), scenario.recording.name
+    names = list(dict.fromkeys(span.object for span in scenario.active_objects))
     if names and scenario.environment is None:
         what = f"spans of {names[0]!r}, but no objects"
         expected = "an environment with the objects' meshes"
-        raise WearcapError(what, where=scenario.recording.name, expected=expected, fix="Give environment=FILE.")
-    shapes = []
-    for name in names:
-        assert scenario.environment is not None
-        where = f"object {name!r} of {scenario.recording.name}"
+        raise WearcapError(what, where=where, expected=expected, fix="Give environment=FILE.")
+    begin_s = path.timestamps[0].item()
+    found = changes(scenario.active_objects)
+    for k, (time_s, name) in enumerate(found):
+        if k + 1 < len(found) and found[k + 1][0] <= begin_s:
+            continue  # over before the first frame
         try:
-            item = scenario.environment.by_name(name)
-            item.check(where)
-            shapes.append(reader(item))
+            objects.activate(name, max(time_s, begin_s))
         except WearcapError as error:
-            raise WearcapError(error.what, where=where, expected=error.expected, fix=error.fix) from error
-    return shapes
+            place = f"object {name!r} of {where}"
+            raise WearcapError(error.what, where=place, expected=error.expected, fix=error.fix) from error
+    for name, track in scenario.observed.object_motion.items():
+        if name not in names:
+            expected = f"one of {', '.join(names) or 'no objects'}"
+            raise WearcapError(f"an observed object {name!r}", where=where, expected=expected)
+        _frames(track.timestamps, path, where)
+        for number, time_s in enumerate(track.timestamps.tolist()):
+            objects.see(name, time_s, track.T_world_body[number])
+    return objects
 
 
-def _observed(
-    scenario: Scenario, path: HeadPath, names: list[str], objects: list[ObjectShape], active: Tensor
-) -> tuple[Tensor, ...]:
-    """Observed values, each at its nearest frame, and a mask of observed frames per modality."""
-    count, seen, where = len(path.timestamps), scenario.observed, scenario.recording.name
-    joints = len(path.skeleton)
-    R, root = torch.eye(3).repeat(count, joints, 1, 1), torch.zeros(count, 3)
-    R_object, t_object = torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3)
-    contact, is_observed = torch.zeros(count, CONTACTS), torch.zeros(count, len(MODALITIES), dtype=torch.bool)
+def _with_observed(scenario: Scenario, path: HeadPath, frames: Conditioning) -> Conditioning:
+    """The frames with the observed values of body and contacts, each at its nearest frame."""
+    seen, where, joints = scenario.observed, scenario.recording.name, len(path.skeleton)
+    R, root, contact = (part.clone() for part in (frames.R_parent_joint, frames.t_world_root, frames.contact))
+    is_observed = frames.is_observed.clone()
     if seen.motion is not None:
         at = _frames(seen.motion.timestamps, path, where)
         if len(seen.motion.skeleton) != joints:
             what = f"an observed body of {len(seen.motion.skeleton)} joints"
             raise WearcapError(what, where=where, expected=f"{joints}, as the wearer has")
-        R[at], root[at] = seen.motion.R_parent_joint.float(), seen.motion.t_world_root.float()
-        is_observed[at, 0] = True
-    for name, track in seen.object_motion.items():
-        if name not in names:
-            expected = f"one of {', '.join(names) or 'no objects'}"
-            raise WearcapError(f"an observed object {name!r}", where=where, expected=expected)
-        at, number = _frames(track.timestamps, path, where), names.index(name)
-        mine = active[at] == number
-        T = objects[number].centred(track.T_world_body)
-        R_object[at[mine]], t_object[at[mine]] = T.R[mine].float(), T.t[mine].float()
-        is_observed[at[mine], 1] = True
-    if scenario.placed and scenario.environment is not None:
-        for number, name in enumerate(names):
-            first = (active == number).nonzero()[:1, 0]
-            if len(first) and not is_observed[first, 1]:
-                T = objects[number].centred(scenario.environment.by_name(name).T_world_object)
-                R_object[first], t_object[first] = T.R.float(), T.t.float()
-                is_observed[first, 1] = True
+        R[0, at], root[0, at] = seen.motion.R_parent_joint.float(), seen.motion.t_world_root.float()
+        is_observed[0, at, 0] = True
     if seen.contact is not None and seen.contact_times is not None:
         at = _frames(seen.contact_times, path, where)
         if seen.contact.shape[1] != CONTACTS:
             expected = f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet"
             raise WearcapError(f"observed contacts of {seen.contact.shape[1]} points", where=where, expected=expected)
-        contact[at] = seen.contact.float()
-        is_observed[at, 2] = True
-    for value in (R, root, R_object, t_object, contact):
+        contact[0, at] = seen.contact.float()
+        is_observed[0, at, 2] = True
+    for value in (R, root, frames.R_world_object, frames.t_world_object, contact):
         if not value.isfinite().all():
             raise WearcapError("observations that are NaN or infinite", where=where, expected="finite values")
-    return R, root, R_object, t_object, contact, is_observed
+    return frames._replace(R_parent_joint=R, t_world_root=root, contact=contact, is_observed=is_observed)
 
 
 def _frames(times: Float64[Tensor, "frame"], path: HeadPath, where: str) -> Tensor:

@@ -22,6 +22,7 @@ from wearcap.recording.active_objects import ActiveSpan, true_spans
 from wearcap.runtime.graphs import chosen
 from wearcap.runtime.needs import HEAD, HEIGHT, TRACKED_WRISTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
+from wearcap.runtime.windows import batched
 from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
 from wearcap.systems.echo.model import EchoRunner
@@ -32,7 +33,7 @@ from wearcap.systems.echo.windows import AveragedWindows, Rewindow
 from wearcap.systems.echo.wrists import Reaching, reaches
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import head_path
-from wearcap.tracking.refinement import Measured, Refinement, held_in_gaps
+from wearcap.tracking.refinement import Measured, Refinement, refined_over
 
 
 @dataclass(frozen=True)
@@ -249,12 +250,13 @@ class Echo(LearnedSystem):
             [scenarios[k].recording.shape for k, *_ in parts],
             [items[k].objects for k, *_ in parts],
         )
-        conditioning, frames = [], torch.arange(max(stop - start for _, start, stop in parts))
-        for k, start, stop in parts:  # the last frame repeated as not valid pads a stretch
-            padded, inside = items[k].conditioning.frames((start + frames).clamp_max(stop - 1)), frames < stop - start
-            is_observed = padded.is_observed & inside[:, None]
-            conditioning.append(padded._replace(valid=padded.valid & inside, is_observed=is_observed))
-        together = queue.run(Conditioning(*(torch.cat(fields) for fields in zip(*conditioning))))
+        lengths = torch.tensor([stop - start for _, start, stop in parts])
+        stretches = [items[k].conditioning.frames(slice(start, stop)) for k, start, stop in parts]
+        whole = batched(stretches, int(lengths.max()))
+        # The last frame repeated as not valid pads a stretch.
+        inside = torch.arange(whole.valid.shape[1]) < lengths[:, None]
+        whole = whole._replace(valid=whole.valid & inside, is_observed=whole.is_observed & inside[..., None])
+        together = queue.run(whole)
         found: list[list[Outputs]] = [[] for _ in items]
         for row, (k, start, stop) in enumerate(parts):
             found[k].append(Outputs(*(field[row : row + 1, : stop - start] for field in together)))
@@ -269,15 +271,10 @@ class Echo(LearnedSystem):
         settings, contacts = self.settings(), self.model.contacts
         motions = [motion_of(item, part, self.anchor, settings, contacts) for item, part in zip(items, outputs)]
         # 4. It is smoothed, its feet are held, and its arms reach the tracked wrists.
-        return [self._refined(motion, item) for motion, item in zip(motions, items)]
-
-    def _refined(self, motion: Motion, item: BatchItem) -> Motion:
-        """Step 4; the frames between stretches keep the refined pose before them."""
-        if self.refinement is None:
-            return motion
-        path = item.path
-        motion = self.refinement.refined(motion, measured_of(item), path.stretches, self.fps, self.anchor)
-        return motion if len(path.stretches) == 1 else held_in_gaps(motion, path, self.anchor)
+        return [
+            refined_over(self.refinement, motion, measured_of(item), item.path, self.fps, self.anchor)
+            for motion, item in zip(motions, items)
+        ]
 
     def queue(
         self,
@@ -287,10 +284,8 @@ class Echo(LearnedSystem):
         objects: Sequence[Sequence[ObjectShape]],
     ) -> EchoQueue:
         """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
-        queue = EchoQueue(self, skeletons, seeds)
-        if self.stride is not None:
-            windows = AveragedWindows if self.sampling.average else Rewindow
-            queue = windows(self, skeletons, seeds, self.stride, self.sampling.rewindow_steps)
+        kind = AveragedWindows if self.sampling.average else Rewindow
+        queue = (EchoQueue if self.stride is None else kind)(self, skeletons, seeds)
         if self.contact_use.guidance is not None:
             queue.guide(pulled_by(skeletons, shapes, objects))
         return queue

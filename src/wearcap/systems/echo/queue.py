@@ -1,12 +1,13 @@
 """ECHO's queue of frames (ECHO §3.3): conditioning enters frame by frame, final outputs leave frame by frame."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple, Protocol, runtime_checkable
+from itertools import chain
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -14,11 +15,12 @@ from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.features import body_size
 from wearcap.data.transforms import mirrored_rotations
-from wearcap.diffusion.conveyor import Conveyor, Correct, Denoise, Observation, RollingSchedule
+from wearcap.diffusion.conveyor import Conveyor, Correct, Observation
 from wearcap.diffusion.observed import residual_weights, with_residuals
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
+from wearcap.runtime.windows import Window, cut
 from wearcap.systems.echo.features import TWIN_CONTACTS, TWIN_POINTS, Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.model import EchoDenoiser
 
@@ -27,6 +29,7 @@ class Conditioning(NamedTuple):
     """Conditioning of frames of several batch items: three tracked points, the active object, and observed values of
     the outputs."""
 
+    timestamps: Float64[Tensor, "batch frame"]
     R_world_point: Float[Tensor, "batch frame point 3 3"]
     t_world_point: Float[Tensor, "batch frame point 3"]
     floor_height: Float[Tensor, "batch frame"]
@@ -51,7 +54,7 @@ class Conditioning(NamedTuple):
 
     def frames(self, part: slice | Tensor) -> "Conditioning":
         """A selection of frames."""
-        return Conditioning(*(field[:, part] for field in self))
+        return cut(self, part)
 
     def mirrored(self, skeleton: Skeleton) -> "Conditioning":
         """The frames mirrored left to right; the object is mirrored along its own y axis, too, so that its pose stays a
@@ -69,6 +72,11 @@ class Conditioning(NamedTuple):
             t_world_object=self.t_world_object * flip,
             contact=self.contact[..., TWIN_CONTACTS],
         )
+
+    @property
+    def T_world_head(self) -> Rigid:
+        """Measured head poses."""
+        return Rigid(self.R_world_point[:, :, 0], self.t_world_point[:, :, 0])
 
     @property
     def points(self) -> ThreePoints:
@@ -119,85 +127,103 @@ class EchoModel:
     """Whether the network was trained on contacts."""
 
 
-class _Sampling(Protocol):
-    """The part of a pipeline's sampling that the queue uses."""
-
-    @property
-    def observed_length_scale(self) -> float | None: ...
-
-    @property
-    def mirror_average(self) -> bool: ...
-
-
-@runtime_checkable
-class Pipeline(Protocol):
-    """The part of a pipeline that the queue uses."""
-
-    model: EchoModel
-    sampling: "_Sampling"
-    device: str
-
-    @property
-    def rolling(self) -> RollingSchedule: ...
-
-    def denoiser(
-        self, queue: "EchoQueue", conditioning: Conditioning, frame: Rigid
-    ) -> tuple[Denoise, list[Correct]]: ...
-
-
-class EchoQueue:
+class EchoQueue(Window[Conditioning]):
     """Frames of several batch items, at most a window of them; each batch item's noise comes from its own seed."""
 
-    def __init__(self, pipeline: Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+    def __init__(self, pipeline: Any, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+        """`pipeline`: an `Echo`, whose network denoises the frames."""
         self.pipeline = pipeline
         self.size = torch.stack([body_size(skeleton) for skeleton in skeletons])
         self.t_parent_joint = torch.stack([skeleton.t_parent_joint for skeleton in skeletons])[:, None]
         model, self.rolling = pipeline.model, pipeline.rolling
+        super().__init__(self.rolling.window)
         self.conveyor = Conveyor(self.rolling, model.schedule, model.net.sizes, len(seeds))
-        self.conditioning: Conditioning | None = None
         self.guided: Guided | None = None
         """Bodies and objects, for a pipeline with guidance."""
         self._random = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._frame: Rigid | None = None
+        self._padded = 0
+        """Number of padding frames after the last one."""
+        self._final: list[tuple[Conditioning, Outputs]] = []
+        """Final frames that were not taken yet."""
+
+    def correct(self, T_world_head: Rigid) -> None:
+        """Replace the head poses of the newest frames, as far as these are not final."""
+        frames, count = self.frames, min(len(T_world_head.t), self.pending)
+        if frames is not None and count:
+            R, t = frames.R_world_point.clone(), frames.t_world_point.clone()
+            R[0, -count:, 0], t[0, -count:, 0] = T_world_head.R[-count:], T_world_head.t[-count:]
+            self.frames = frames._replace(R_world_point=R, t_world_point=t)
 
     def guide(self, guided: Guided) -> None:
         """Give the queue the bodies and objects that guidance needs."""
         self.guided = guided
 
+    @property
+    def pending(self) -> int:
+        """Number of frames that are not final."""
+        return max(0, self.taken - self._padded - self.final)
+
     @torch.no_grad()
-    def push(self, fresh: Conditioning) -> Outputs | None:
-        """Add one frame of every batch item (padding after a batch item's end); returns the frames that became final, if
-        any."""
-        noise = self._noise(1)[:, 0]
-        full = self.conveyor.push(noise)
-        if self.conditioning is not None:
-            fresh = Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
-        self.conditioning = fresh
-        frame = self.pipeline.model.features.canonical(self.conditioning.points)
+    def push(self, fresh: Conditioning) -> None:
+        """Add frames of every batch item (padding after a batch item's end)."""
+        self._final += map(self._with_conditioning, self._advanced(fresh))
+
+    @torch.no_grad()
+    def take(self, ended: bool = False) -> tuple[Conditioning, Outputs] | None:
+        """Frames that became final since the last call, or None; `ended`: with all others, as none will follow."""
+        if ended:
+            self._final += map(self._with_conditioning, self._rest())
+        if not self._final:
+            return None
+        given, outputs = zip(*self._final)
+        self._final = []
+        frames, found = (type(parts[0])(*(torch.cat(each, 1) for each in zip(*parts))) for parts in (given, outputs))
+        real = slice(frames.valid.shape[1] - max(0, self.final + self._padded - self.taken))
+        return frames.frames(real), cut(found, real)
+
+    def _with_conditioning(self, outputs: Outputs) -> tuple[Conditioning, Outputs]:
+        assert self.frames is not None
+        return self.frames.frames(slice(self.final_count - outputs.t_world_root.shape[1], self.final_count)), outputs
+
+    def _advanced(self, fresh: Conditioning) -> Iterator[Outputs]:
+        first, count = 0, fresh.valid.shape[1]
+        while first < count:
+            part, first = slice(first, min(first + self._due, count)), first + self._due
+            self.append(fresh.frames(part))
+            if (outputs := self._advance()) is not None:
+                yield outputs
+
+    @property
+    def _due(self) -> int:
+        """Number of new frames that are needed to go on."""
+        return 1
+
+    def _advance(self) -> Outputs | None:
+        """Go on by the newest frame; returns the frame that became final, if any."""
+        conditioning, full = self.frames, self.conveyor.push(self._noise(1)[:, 0])
+        assert conditioning is not None
+        frame = self.pipeline.model.features.canonical(conditioning.points)
         if self.pipeline.model.features.moves and full:
             # The conveyor's frames are re-expressed in the window's new canonical frame.
             assert self._frame is not None
             change = frame.inverse() @ self._frame
-            self.conveyor.x = self._reexpressed(self.conveyor.x, change, self.conveyor.level, self.conditioning)
+            self.conveyor.x = self._reexpressed(self.conveyor.x, change, self.conveyor.level, conditioning)
         self._frame = frame
         count = len(self.conveyor.age)
         noise = self._noise(self.rolling.per_frame * count).unflatten(1, (self.rolling.per_frame, count))
-        observation = self._observation(self.conditioning, frame)
-        denoise, corrections = self.pipeline.denoiser(self, self.conditioning, frame)
-        correct = self._corrected(corrections, self.conditioning, observation)
+        observation = self._observation(conditioning, frame)
+        denoise, corrections = self.pipeline.denoiser(self, conditioning, frame)
+        correct = self._corrected(corrections, conditioning, observation)
         self.conveyor.run(denoise, observation, noise.transpose(0, 1), correct)
-        clean = self.conveyor.clean
-        return self._decoded(self.conveyor.x, slice(clean - 1, clean), frame) if clean else None
+        part = self.finalize(self.rolling.ramp - 1)
+        return self._decoded(self.conveyor.x, part, frame) if part.stop > part.start else None
 
+    @torch.no_grad()
     def run(self, whole: Conditioning) -> Outputs:
         """Outputs of all frames of a batch."""
-        count, pushed, final = whole.valid.shape[1], 0, 0
-        out = None
-        while final < count:
-            outputs = self.push(whole.frames(slice(pushed, pushed + 1)) if pushed < count else self.padding())
-            pushed += 1
-            if outputs is None:
-                continue
+        count, out, final = whole.valid.shape[1], None, 0
+        for outputs in chain(self._advanced(whole), self._rest()):
             if out is None:  # allocate once: keeping small per-frame tensors fragments memory
                 out = Outputs(*(field.new_empty(len(field), count, *field.shape[2:]) for field in outputs))
             stop = min(final + outputs.t_world_root.shape[1], count)
@@ -207,10 +233,16 @@ class EchoQueue:
         assert out is not None
         return out
 
-    def padding(self) -> Conditioning:
+    def _rest(self) -> Iterator[Outputs]:
+        """Outputs of the frames that are left, once padding follows them."""
+        while self.pending:
+            self._padded += 1
+            yield from self._advanced(self._padding())
+
+    def _padding(self) -> Conditioning:
         """A padding frame for all batch items: the last frame repeated as not valid."""
-        assert self.conditioning is not None
-        last = self.conditioning.frames(slice(-1, None))
+        assert self.frames is not None
+        last = self.frames.frames(slice(-1, None))
         return last._replace(valid=torch.zeros_like(last.valid), is_observed=torch.zeros_like(last.is_observed))
 
     def _noise(self, rows: int) -> Float[Tensor, "batch row feature"]:

@@ -7,10 +7,10 @@ latency of a pose is `Echo.latency_s`. Memory use is bounded.
 import math
 from bisect import bisect_left
 from collections.abc import Sequence
-from itertools import groupby
 from typing import Any
 
 import torch
+from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
@@ -18,26 +18,23 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording import Motion
-from wearcap.recording.active_objects import SAME_S, changes
-from wearcap.recording.timing import joined
+from wearcap.recording.active_objects import changes
 from wearcap.runtime.graphs import undisturbed
 from wearcap.runtime.session import HeadAndWristsStream, Session
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
+from wearcap.runtime.windows import appended, cut
 from wearcap.scene.objects import Environment
 from wearcap.sensors import packets
-from wearcap.sensors.packets import MAX_WAITING
+from wearcap.sensors.packets import MAX_WAITING, Admitted
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
 from wearcap.systems.echo.contacts import StaticObjects
-from wearcap.systems.echo.features import CONTACTS
-from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, ObjectShape, wrist_poses
+from wearcap.systems.echo.objects import ActiveObjects
+from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, wrist_poses
 from wearcap.systems.echo.pipeline import Echo, measured_of, motion_of, pulled_by, stretch_seed
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
 from wearcap.tracking.floor import CARRIED, FloorTracker
 from wearcap.tracking.head_path import Chunk, HeadPath
-from wearcap.tracking.refinement import Refiner
 
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
@@ -54,35 +51,23 @@ class EchoStream(HeadAndWristsStream):
         if how.rewindow is not None and not how.average:
             what = f"a stream with rewindow={how.rewindow}"
             raise WearcapError(what, expected="average=true, or a conveyor: rewindow=null, rewindow_steps=null")
-        super().__init__(pipeline, pipeline.fps, 1)
-        self.wearer, self.seed = wearer, seed
-        self._environment, self._reader = environment, pipeline.reader()
-        self._shapes: dict[str, ObjectShape] = {}
-        """Objects that were named so far, in order of their first use."""
-        self._queue: EchoQueue | None = None
-        self._activated: list[tuple[float, str | None]] = []
-        self._seen: list[tuple[float, str, Rigid]] = []
-        self._restart()
+        super().__init__(pipeline, wearer, stride=1, needs_s=-1e-6)
+        self.seed = seed
+        self._objects = ActiveObjects(pipeline.reader(), environment, pipeline.placed)
+        self._begin()
 
-    def _guide(self) -> None:
-        """Give the queue the bodies and objects that guidance needs, if any."""
-        if self._queue is not None and self.pipeline.contact_use.guidance is not None:
-            shape, objects = dict(self.wearer.shape), list(self._shapes.values())
-            self._queue.guide(pulled_by([self.wearer.skeleton], [shape], [objects]))
-
-    def _restart(self, again: bool = False) -> None:
-        if again:
-            active = next((name for start, name in reversed(self._activated) if start <= self._track.newest), None)
-            self._activated = [] if active is None else [(-math.inf, active)]
-            self._seen = []
-        super()._restart(again)
-        self._queue = None
-        self._refiner: Refiner | None = None
-        self._pending: list[tuple[float, Conditioning, Rigid]] = []
-        """Time, conditioning and head pose of frames that were consumed but not output yet."""
+    def _begin(self) -> None:
+        super()._begin()
         self._floor = FloorTracker(CARRIED * self.wearer.skeleton.height_of("head"), self.pipeline.fps)
         threshold = self.pipeline.contact_use.static_threshold
         self._static = None if threshold is None else StaticObjects(threshold)
+
+    def _restart(self, admitted: Admitted) -> None:
+        if admitted.again:
+            active = self._objects.active(self._track.newest)
+            self._objects.changes = [] if active is None else [(-math.inf, active)]
+            self._objects.seen = []
+        super()._restart(admitted)
 
     def wrist(self, joint: str, timestamp: float, T_world_joint: Rigid) -> None:
         """Add a pose of a wrist joint; duplicates are ignored.
@@ -119,100 +104,51 @@ class EchoStream(HeadAndWristsStream):
         if fault := packets.time_fault(timestamp):
             self._head_input.refuse("activate", fault)
             return
-        if name is not None:
-            used_before = name in self._shapes
-            self._shape(name)
-            if self.pipeline.placed and not used_before and self._environment is not None:
-                # Half a frame later, so that the first frame from `timestamp` on is the nearest one.
-                soon = timestamp + 0.499 / self.pipeline.fps
-                self._see(name, soon, self._environment.by_name(name).T_world_object)
-        self._activated = [span for span in self._activated if span[0] < timestamp] + [(timestamp, name)]
-        del self._activated[:-MAX_WAITING]
-        self._update_pending()
+        self._objects.activate(name, timestamp)
+        del self._objects.changes[:-MAX_WAITING]
+        self._update()
 
     def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
         """Add an observed pose of an object at a time (s), from a camera for instance (ECHO §4.2).
 
         Raises as `activate` does.
         """
-        self._shape(name)
+        self._objects.shape(name)
         newest = self._head_input.clock.newest
         if fault := packets.time_fault(timestamp) or packets.pose_fault(T_world_object):
             self._head_input.refuse(name, fault)
         elif math.isfinite(newest) and abs(timestamp - newest) > packets.CONNECTED_S:
             self._head_input.refuse(name, packets.OFF_THE_CLOCK)
         else:
-            self._see(name, float(timestamp), packets.owned_pose(T_world_object))
+            self._objects.see(name, float(timestamp), packets.owned_pose(T_world_object))
+        del self._objects.seen[:-MAX_SEEN]
+        self._update()
 
-    def _see(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
-        self._seen.append((timestamp, name, self._shape(name).centred(T_world_object)))
-        del self._seen[:-MAX_SEEN]
-        self._update_pending()
+    def _update(self) -> None:
+        """Update the queue's frames that are not final with what is known of objects now."""
+        if (queue := self.windows) is None or queue.frames is None:
+            return
+        if queue.guided is not None and len(queue.guided[1][0]) < len(self._objects.shapes):
+            queue.guide(pulled_by([self.wearer.skeleton], [dict(self.wearer.shape)], [self._objects.shapes]))
+        if count := queue.pending:
+            fresh = self._objects.updated(queue.frames.frames(slice(-count, None)))
+            queue.frames = appended(queue.frames.frames(slice(-count)), fresh)
 
-    def _shape(self, name: str) -> ObjectShape:
-        if name not in self._shapes:
-            if self._environment is None:
-                raise WearcapError(f"no object {name!r}", expected="a session with an environment")
-            item = self._environment.by_name(name)
-            item.check(f"object {name!r}")
-            self._shapes[name] = self._reader(item)
-            self._guide()
-        return self._shapes[name]
-
-    def _final(self, ended: bool) -> Motion | None:
-        while (chunk := self._track.next(ended)) is not None:
-            self._chunks.append(chunk)
-        motions: list[Motion] = []
+    def _advance(self, ended: bool) -> None:
         with undisturbed(self.pipeline.runtime == "onnx"):
-            while self._chunks and (ended or self._complete(self._chunks[0])):
-                motions += self._advance(self._chunks.pop(0))
-            if ended or not (self._chunks or self._track.inside):
-                motions += self._finish()
-        return joined(motions)
+            super()._advance(ended)
 
-    def _complete(self, chunk: Chunk) -> bool:
-        """Whether the poses of both wrists at a frame have arrived, or count as lost."""
-        time = chunk.timestamps[-1].item()
-        return self._wrists.arrived(time - 1e-6, time, self._track.newest, MAX_GAP_S)
+    def _opened(self, chunk: Chunk) -> EchoQueue:
+        seeds, shapes = [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)]
+        return self.pipeline.queue([self.wearer.skeleton], seeds, shapes, [self._objects.shapes])
 
-    def _advance(self, chunk: Chunk) -> list[Motion]:
-        motions: list[Motion] = []
-        if chunk.begins or self._queue is None:
-            motions += self._finish()
-            seeds, shapes = [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)]
-            self._queue = self.pipeline.queue([self.wearer.skeleton], seeds, shapes, [list(self._shapes.values())])
-        mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
-        T_world_head = chunk.T_world_device @ mount
-        # The head poses of the last frames may have been corrected.
-        corrected = chunk.corrected @ mount
-        count = min(len(corrected.t), len(self._pending))
-        for k in range(-count, 0):
-            before_s, conditioning, _ = self._pending[k]
-            at = corrected[len(corrected.t) + k : len(corrected.t) + k + 1]
-            R, t = conditioning.R_world_point.clone(), conditioning.t_world_point.clone()
-            R[0, 0, 0], t[0, 0, 0] = at.R[0], at.t[0]
-            self._pending[k] = (before_s, conditioning._replace(R_world_point=R, t_world_point=t), at)
-        if count:
-            self._update_pending()
-        time = chunk.timestamps[0].item()
-        conditioning = self._frame(time, T_world_head)
-        assert self._queue is not None
-        outputs = self._queue.push(conditioning)
-        self._pending.append((time, conditioning, T_world_head))
-        return motions + self._emit(outputs)
+    def _sensed(self, chunk: Chunk, ended: bool) -> tuple[Conditioning]:
+        if len(chunk.corrected.t):
+            self._update()
+        return (self._frame(chunk.timestamps, self._head_of(chunk.T_world_device)),)
 
-    def _finish(self) -> list[Motion]:
-        """The remaining frames of a stretch that has ended."""
-        motions: list[Motion] = []
-        while self._queue is not None and self._pending:
-            motions += self._emit(self._queue.push(self._queue.padding()))
-        if self._refiner is not None:
-            motions += self._refiner.finish()
-        self._queue, self._refiner = None, None
-        return motions
-
-    def _frame(self, time: float, T_world_head: Rigid) -> Conditioning:
-        poses = [T_world_head]
+    def _frame(self, timestamps: Float64[Tensor, "1"], T_world_head: Rigid) -> Conditioning:
+        poses, time = [T_world_head], timestamps.item()
         for joint in WRISTS:
             seen = self._wrists.samples[joint]
             if not seen or seen[-1][0] < time - MAX_GAP_S:
@@ -220,7 +156,7 @@ class EchoStream(HeadAndWristsStream):
             if seen:
                 times, R, t = zip(*seen)
                 track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
-                pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
+                pose = wrist_poses(track, timestamps)
                 poses.append(Rigid(pose.R.float(), pose.t.float()))
                 # Only the last second is needed, and one pose before it.
                 old = bisect_left(seen, time - 1.0, key=lambda pose: pose[0]) - 1
@@ -234,87 +170,32 @@ class EchoStream(HeadAndWristsStream):
         floor = torch.full((1,), self.wearer.floor_m or 0.0)
         if self.wearer.floor_m is None:
             floor = self._floor.follow(T_world_head.t)
-        valid, is_observed = torch.ones(1, dtype=torch.bool), torch.zeros(1, len(MODALITIES), dtype=torch.bool)
-        body = torch.eye(3).repeat(1, len(self.wearer.skeleton), 1, 1), torch.zeros(1, 3)
-        unobserved = *body, torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, CONTACTS)
-        fields = R, t, floor, *self._active(time), valid, *unobserved, is_observed
-        return self._with_observed_object(Conditioning(*(value[None] for value in fields)), time)
+        return self._objects.frames(timestamps, R, t, floor, len(self.wearer.skeleton))
 
-    def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Whether an object is active at a time, its codes and its index."""
-        name = next((name for start, name in reversed(self._activated) if start <= time + SAME_S), None)
-        if name is None:
-            nothing = self._reader.nothing[None]
-            return torch.zeros(1, dtype=torch.bool), nothing, nothing, torch.full((1,), -1.0)
-        number, shape = torch.full((1,), float(list(self._shapes).index(name))), self._shapes[name]
-        return torch.ones(1, dtype=torch.bool), shape.code[None], shape.code_mirrored[None], number
-
-    def _with_observed_object(self, conditioning: Conditioning, time: float) -> Conditioning:
-        """The conditioning with the active object's observation nearest in time, if one is within half a frame."""
-        if not conditioning.has_object.item():
-            return conditioning
-        active, near = list(self._shapes)[int(conditioning.object_number)], 0.5 / self.pipeline.fps + 1e-6
-        seen = [(abs(at - time), T) for at, name, T in self._seen if name == active and abs(at - time) <= near]
-        if not seen:
-            return conditioning
-        _, T = min(seen, key=lambda pair: pair[0])
-        is_observed = conditioning.is_observed.clone()
-        is_observed[..., 1] = True
-        return conditioning._replace(
-            R_world_object=T.R[None, None], t_world_object=T.t[None, None], is_observed=is_observed
-        )
-
-    def _update_pending(self) -> None:
-        """Update the conditioning of the queue's frames with inputs that arrived after them."""
-        if self._queue is None or self._queue.conditioning is None or not self._pending:
+    def _take(self, ended: bool) -> None:
+        if (found := self.windows.take(ended)) is None:
             return
-        whole, first = self._queue.conditioning, self._queue.conditioning.valid.shape[1] - len(self._pending)
-        frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
-        for k, (time, conditioning, head) in enumerate(self._pending):
-            names = "has_object", "object_code", "object_code_mirrored", "object_number"
-            active = {name: value[None] for name, value in zip(names, self._active(time), strict=True)}
-            changed = conditioning._replace(**active, is_observed=torch.zeros_like(conditioning.is_observed))
-            changed = self._with_observed_object(changed, time)
-            self._pending[k] = (time, changed, head)
-            frames.append(changed)
-        self._queue.conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*frames)))
+        frames, outputs = found
+        # One piece for each active object, or none
+        _, lengths = frames.object_number[0].unique_consecutive(return_counts=True)
+        stop = 0
+        for length in lengths.tolist():
+            part, stop = slice(stop, stop + length), stop + length
+            self._take_piece(frames.frames(part), cut(outputs, part))
 
-    def _emit(self, outputs: Outputs | None) -> list[Motion]:
-        """The motion of frames that became final; those of padding are left out."""
-        if outputs is None:
-            return []
-        count, first = min(outputs.t_world_root.shape[1], len(self._pending)), 0
-        leaving, self._pending = self._pending[:count], self._pending[count:]
-        motions: list[Motion] = []
-        for _, alike in groupby(leaving, key=lambda frame: frame[1].object_number.item()):
-            frames = list(alike)
-            part, first = slice(first, first + len(frames)), first + len(frames)
-            motions += self._emit_frames(frames, Outputs(*(field[:, part] for field in outputs)))
-        return motions
-
-    def _emit_frames(self, frames: Sequence[tuple[float, Conditioning, Rigid]], outputs: Outputs) -> list[Motion]:
+    def _take_piece(self, frames: Conditioning, outputs: Outputs) -> None:
         """The same for successive frames with one active object, or none."""
-        times, every, heads = zip(*frames)
-        conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*every)))
-        T_world_head = Rigid(torch.cat([head.R for head in heads]), torch.cat([head.t for head in heads]))
-        clock, stretches = torch.tensor(times, dtype=torch.float64), ((0, len(times)),)
-        skeleton, floor_height = self.wearer.skeleton, conditioning.floor_height[0]
-        path = HeadPath(clock, T_world_head, T_world_head, floor_height, skeleton, stretches)
-        # Object events that no later frame needs are dropped.
-        self._seen = [row for row in self._seen if row[0] > times[-1] - 1.0]
-        past = [k for k, (start, _) in enumerate(self._activated) if start <= times[-1]]
-        self._activated = self._activated[past[-1] :] if past else self._activated
+        times, T_world_head, count = frames.timestamps[0], frames.T_world_head[0], frames.valid.shape[1]
+        floor_height, stretches = frames.floor_height[0], ((0, count),)
+        path = HeadPath(times, T_world_head, T_world_head, floor_height, self.wearer.skeleton, stretches)
+        self._objects.forget(times[-1].item())
         if self._static is not None:
-            one = (Outputs(*(field[:, k : k + 1] for field in outputs)) for k in range(len(times)))
-            static = [self._static(each, part) for each, part in zip(every, one)]
+            each = [slice(k, k + 1) for k in range(count)]
+            static = [self._static(frames.frames(one), cut(outputs, one)) for one in each]
             outputs = Outputs(*(torch.cat(fields, 1) for fields in zip(*static)))
-        pipeline, item = self.pipeline, BatchItem(path, conditioning, list(self._shapes.values()))
+        pipeline, item = self.pipeline, BatchItem(path, frames, self._objects.shapes)
         motion = motion_of(item, outputs, pipeline.anchor, pipeline.settings(), pipeline.model.contacts)
-        if pipeline.refinement is None:
-            return [motion]
-        if self._refiner is None:
-            self._refiner = Refiner(pipeline.refinement, motion.skeleton, pipeline.fps, pipeline.anchor)
-        return self._refiner.push(motion, measured_of(item))
+        self._refine(motion, measured_of(item))
 
 
 class EchoSession(Session):

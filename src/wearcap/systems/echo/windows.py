@@ -3,41 +3,35 @@ left), or averaged (ours)."""
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn import functional as F
 
 from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.transforms import joint_twins
 from wearcap.diffusion.process import posterior_step, step_levels
 from wearcap.geometry.rotation import matrix_from_rot6d, rot6d_from_matrix
+from wearcap.runtime.windows import moved_on
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.queue import Conditioning, EchoQueue, Guided, Outputs, Pipeline
+from wearcap.systems.echo.queue import Conditioning, EchoQueue, Guided, Outputs
 
 
 class Rewindow(EchoQueue):
     """Windows that advance by `stride` frames: the last final frames (at most the context) are inpainted, the next
     `stride` frames become final, and the rest is discarded.
 
-    With the conveyor's context, a frame sees as much of the past and future as on the conveyor. `steps` (None: those of
-    a frame on the conveyor) are a window's: as many network evaluations as the conveyor's are `per_frame` times `stride`.
+    With the conveyor's context, a frame sees as much of the past and future as on the conveyor. As many network evaluations
+    of a window as the conveyor's are `per_frame` times `stride` steps.
     """
 
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        skeletons: Sequence[Skeleton],
-        seeds: Sequence[int],
-        stride: int = 10,
-        steps: int | None = None,
-    ):
+    def __init__(self, pipeline: Any, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
         super().__init__(pipeline, skeletons, seeds)
-        self.stride, self.steps = stride, steps or self.rolling.steps
+        self.stride, self.steps = pipeline.stride, pipeline.sampling.rewindow_steps or self.rolling.steps
 
     @torch.no_grad()
     def window(
@@ -101,27 +95,19 @@ class AveragedWindows(Rewindow):
     window counts as much.
     """
 
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        skeletons: Sequence[Skeleton],
-        seeds: Sequence[int],
-        stride: int = 10,
-        steps: int | None = None,
-    ):
-        super().__init__(pipeline, skeletons, seeds, stride, steps)
+    def __init__(self, pipeline: Any, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+        super().__init__(pipeline, skeletons, seeds)
         self._mirror = pipeline.sampling.mirror_average
         if self._mirror:  # the batch items' mirrored twins follow them
             twins = joint_twins(pipeline.model.skeleton)
             mirrored = self.t_parent_joint[..., twins, :] * torch.tensor(MIRROR)
             self.t_parent_joint, self.size = torch.cat([self.t_parent_joint, mirrored]), self.size.repeat(2, 1)
             self._random += [torch.Generator().manual_seed(seed) for seed in seeds]
-        self._sum = torch.zeros(len(seeds), 0, 0)
-        """Weighted sums of the predictions for the frames of `conditioning` (`_flat`), and sums of weights."""
+        joints = self.t_parent_joint.shape[-2]
+        self._sum = torch.zeros(len(seeds), 0, 6 * (joints + 1) + 3 + 3 + CONTACTS + 1)
+        """Weighted sums of the predictions for the last window's frames (`_flat`), and sums of weights."""
         self._given = torch.zeros(len(seeds), 0, _GIVEN)
         """What these predictions were for (`_given`)."""
-        self._pushed, self._final = 0, 0
-        """Numbers of frames that were taken in, and that are final."""
 
     def guide(self, guided: Guided) -> None:
         if self._mirror:
@@ -131,29 +117,28 @@ class AveragedWindows(Rewindow):
             guided = [*surfaces, *surfaces], [*objects, *mirrored]
         super().guide(guided)
 
-    @torch.no_grad()
-    def push(self, fresh: Conditioning) -> Outputs | None:
-        """Add one frame of every batch item (padding after its end); returns the frames that became final, if any."""
-        full = self.conditioning is not None and self.conditioning.valid.shape[1] == self.rolling.window
-        if self.conditioning is not None:
-            fresh = Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
-        self.conditioning = fresh
-        self._pushed += 1
-        self._sum, self._given = (F.pad(part[:, int(full) :], (0, 0, 0, 1)) for part in (self._sum, self._given))
-        if self._pushed % self.stride:
-            return None
-        self._predict(self.conditioning)
-        return self._finalized()
+    @property
+    def _due(self) -> int:
+        return self.stride - self.taken % self.stride
 
-    def _predict(self, conditioning: Conditioning) -> None:
-        """Add the window's prediction to the sums; a frame with another object, observation or pose of a tracked point than
-        in the last window starts anew."""
-        given = _given(conditioning)
-        same, self._given = ((given - self._given).abs() < _ALIKE).all(-1, keepdim=True), given
+    def _advance(self) -> Outputs | None:
+        """Predict a window where `stride` frames have come since the last one; returns the frames that became final.
+
+        A frame with another object, observation or pose of a tracked point than in the last window starts anew. What later
+        windows predict for final frames is not used.
+        """
+        conditioning, joints = self.frames, self.t_parent_joint.shape[-2]
+        assert conditioning is not None
+        if self.taken % self.stride:
+            return None
+        before, given_before = (moved_on(part, self.stride, self.count) for part in (self._sum, self._given))
+        self._given = _given(conditioning)
+        same = ((self._given - given_before).abs() < _ALIKE).all(-1, keepdim=True)
         flat = self._predicted(conditioning)
         flat = torch.cat([flat, torch.ones_like(flat[..., :1])], -1)
-        before = self._sum if self._sum.shape[-1] else torch.zeros_like(flat)
         self._sum = before * same + flat * self._weight(conditioning.valid)[..., None]
+        rows = self._sum[:, self.finalize(self.rolling.ramp - self.stride)]
+        return _unflat(rows[..., :-1] / rows[..., -1:], joints) if rows.shape[1] else None
 
     def _predicted(self, conditioning: Conditioning) -> Float[Tensor, "batch frame value"]:
         """What a window is predicted to be on its own, flat."""
@@ -171,20 +156,10 @@ class AveragedWindows(Rewindow):
     def _weight(self, valid: Bool[Tensor, "batch frame"]) -> Float[Tensor, "batch frame"]:
         count, window = valid.shape[1], self.rolling.window
         place = torch.arange(1, count + 1).expand_as(valid)
-        begins, ended = self._pushed <= window, ~valid[:, -1:]
+        begins, ended = self.taken <= window, ~valid[:, -1:]
         behind = torch.full_like(place, window) if begins else place
         ahead = torch.where(ended, window, count + 1 - place)
         return torch.minimum(behind, ahead).clamp_max(window // 2).square().float()
-
-    def _finalized(self) -> Outputs | None:
-        """The frames that are old enough; what later windows predict for them is not used."""
-        count, lookahead = self._sum.shape[1], self.rolling.ramp - self.stride
-        stop, start = count - lookahead, count - (self._pushed - self._final)
-        if stop <= start:
-            return None
-        self._final += stop - start
-        rows = self._sum[:, start:stop]
-        return _unflat(rows[..., :-1] / rows[..., -1:], self.t_parent_joint.shape[-2])
 
     def run(self, whole: Conditioning) -> Outputs:
         return EchoQueue.run(self, whole)

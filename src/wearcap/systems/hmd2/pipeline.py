@@ -6,46 +6,24 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.features import body_size
-from wearcap.data.surroundings import latest_before
-from wearcap.diffusion.process import Denoise, step_levels
-from wearcap.diffusion.schedule import Schedule
+from wearcap.diffusion.process import Denoise, sample, step_levels
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
-from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.recording import Motion, PointCloud, Recording
+from wearcap.recording import Motion, Recording
 from wearcap.runtime.needs import HEAD, HEIGHT, POINTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
-from wearcap.scene.voxels import voxelize
-from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.systems.hmd2.model import Conditions, MotionDenoiser, StepRunner
-from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler, advance, no_poses
+from wearcap.runtime.windows import FinalPoses, batched, cut, over_path
+from wearcap.systems.hmd2.model import Conditions, StepRunner
+from wearcap.systems.hmd2.sensing import MODALITIES, Sensing
+from wearcap.systems.hmd2.windows import DiffusionModel, Frames, Predicted, WindowSampler, blended
 from wearcap.tracking.anchor import anchored_to_head
-from wearcap.tracking.floor import floor_from_points, tracked_floor
+from wearcap.tracking.floor import floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
-from wearcap.tracking.refinement import Measured, Refinement
-
-MODALITIES = ("points", "images")
-
-
-@dataclass(frozen=True, eq=False)
-class DiffusionModel:
-    """What a training gives a capture: the network, and what it was trained with."""
-
-    net: MotionDenoiser
-    features: HeadFeatures
-    schedule: Schedule
-    skeleton: Skeleton
-    """Skeleton for recordings without one of their own."""
-    fps: float
-    place_encoder: VoxelAutoencoder | None = None
-    image_encoder: str | None = None
-    """Name of the encoder whose embeddings the network was trained on."""
+from wearcap.tracking.refinement import Refinement
 
 
 @dataclass(frozen=True)
@@ -172,50 +150,28 @@ class HMD2(LearnedSystem):
         """One motion per recording and seed."""
         self.prepare()
         recordings = [source.recording for source in sources]
-        # 1. head path and floor; 2. codes of the points around the body; 3. image embeddings; once for all seeds
         once = {id(recording): recording for recording in recordings}
-        path_of = {key: head_path(recording, self.model.skeleton, self.model.fps) for key, recording in once.items()}
+        # 1. head path and floor; 2. codes of the points around the body; 3. image embeddings; once for all seeds
+        path_of = {key: head_path(recording, self.model.skeleton, self.fps) for key, recording in once.items()}
         sensed = {key: self.sense(recording, path_of[key]) for key, recording in once.items()}
-        paths, frames = zip(*((path_of[id(recording)], sensed[id(recording)]) for recording in recordings))
-        # 4. windows of the diffusion model, every stretch of a path separately
-        poses = self._windows(paths, frames, seeds)
+        # 4. windows of the diffusion model; all stretches of all paths share batches
+        paths, samplers = [path_of[id(recording)] for recording in recordings], []
+        for recording, path, seed in zip(recordings, paths, seeds):
+            samplers.append([self.sampler(path.skeleton, seed, start) for start, _ in path.stretches])
+            for stretch, sampler in zip(path.stretches, samplers[-1]):
+                sampler.push(cut(sensed[id(recording)], slice(*stretch)))
+        self.predict([sampler for mine in samplers for sampler in mine])
         # 5. anchor the body to the measured head; 6. smooth it and hold its feet
-        return [self._refined(*parts) for parts in zip(paths, frames, poses)]
+        return [self._refined(*parts) for parts in zip(paths, samplers)]
 
     def sense(self, recording: Recording, path: HeadPath) -> Frames:
-        """Steps 2 and 3: the conditioning of a whole recording, as a batch of one.
-
-        Raises WearcapError for embeddings of an encoder that the network was not trained on.
-        """
-        count, net, camera = len(path.timestamps), self.model.net, recording.camera
-        cloud = recording.points if net.points_size and "points" in self.use else None
-        points, points_valid = torch.zeros(count, net.points_size), torch.zeros(count, dtype=torch.bool)
-        if cloud is not None and (encoder := self.model.place_encoder) is not None:  # what had been seen by each frame
-            grid = voxelize(cloud.points_world, path.T_world_device, encoder.grid, cloud.first_seen, path.timestamps)
-            points = torch.cat([encoder.encode(part) for part in grid.split(2048)])
-            points_valid = torch.ones(count, dtype=torch.bool)
-        image, image_valid = torch.zeros(count, net.image_size), torch.zeros(count, dtype=torch.bool)
-        if net.image_size and "images" in self.use and camera is not None and camera.embedding is not None:
-            size = camera.embedding.shape[1]
-            if (camera.embedding_name, size) != (self.model.image_encoder, net.image_size):
-                what = f"embeddings of {camera.embedding_name!r} with {size} features"
-                expected = f"{net.image_size} of {self.model.image_encoder!r}, which the network was trained on"
-                fix = "Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points]."
-                raise WearcapError(what, where=recording.name, expected=expected, fix=fix)
-            number, image_valid = latest_before(camera.timestamps, path.timestamps)
-            image = camera.embedding[number].float()
-            image_valid &= image.isfinite().all(-1)
-            image = image.nan_to_num(0.0, 0.0, 0.0)
-        head, floor, valid = path.T_world_head, self._floor(cloud, path), torch.ones(count, dtype=torch.bool)
-        fields = head.R, head.t, floor, points, points_valid, image, image_valid, valid
-        return Frames(*(part[None] for part in fields))
-
-    def _floor(self, cloud: PointCloud | None, path: HeadPath) -> Float[Tensor, "time"]:
-        """Floor height (m) below the head: from the points where they are used, else from the head's path."""
-        if self.live:
-            return tracked_floor(cloud, path.timestamps, path.T_world_head.t, path.stature, self.model.fps)
-        floor = floor_from_points(cloud, path.T_world_head.t, path.stature)
-        return path.floor_height if floor is None else floor
+        """Steps 2 and 3: the conditions of a whole recording. Raises WearcapError as `Sensing.of` does."""
+        sensing, floor = Sensing.of(self.model, self.use, recording, path.stature), None
+        if not self.live:  # from the points where they are used, else from the head's path
+            cloud = recording.points if sensing.uses_points else None
+            floor = floor_from_points(cloud, path.T_world_head.t, path.stature)
+            floor = path.floor_height if floor is None else floor
+        return sensing.frames(path.timestamps, path.T_world_device, path.T_world_head, floor)
 
     def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Denoise:
         """x̂0 as a function of x_t, to be called once per sampling step in order; conditions are encoded once."""
@@ -238,50 +194,72 @@ class HMD2(LearnedSystem):
 
         return denoise
 
-    def _windows(self, paths: Sequence[HeadPath], frames: Sequence[Frames], seeds: Sequence[int]) -> list[Poses]:
-        """Step 4: poses of every path, window after window; all stretches of all paths share batches."""
-        stride, lookahead_frames, passed = self.advance, self.lookahead_frames, 0
-        whole = [no_poses(self, len(path.timestamps)) for path in paths]
-        items = [
-            (i, start, stop, self.sampler(path.skeleton, seeds[i], start))
-            for i, path in enumerate(paths)
-            for start, stop in path.stretches
-        ]
-        while items:
-            fresh = []
-            for i, start, stop, _ in items:  # from `stop` on the last frame is repeated and marked as not valid
-                take = torch.arange(start + passed, start + passed + stride)
-                cut = Frames(*(part[:, take.clamp_max(stop - 1)] for part in frames[i]))
-                fresh.append(cut._replace(valid=cut.valid & (take < stop)))
-            advance([sampler for *_, sampler in items], fresh)
-            passed += stride
-            for i, start, stop, sampler in items:
-                ended = start + passed >= stop
-                left = 0 if ended else lookahead_frames
-                (final, _), end = sampler.finalize(left), min(start + passed, stop) - left
-                for target, part in zip(whole[i], final):
-                    target[0, end - part.shape[1] : end] = part[0]
-            items = [item for item in items if item[1] + passed < item[2]]
-        return [Poses(*(part[0] for part in poses)) for poses in whole]
-
     def sampler(self, skeleton: Skeleton, seed: int, start: int) -> WindowSampler:
         """A sampler for the stretch that begins at frame `start`; every stretch of a recording has its own noise."""
-        return WindowSampler(self, body_size(skeleton), seed + 1_000_003 * start)
+        seed = seed + 1_000_003 * start
+        return WindowSampler(self.model.features, skeleton, self.window, self.sampling.steps, seed)
 
-    def _refined(self, path: HeadPath, frames: Frames, poses: Poses) -> Motion:
+    @torch.inference_mode()
+    def predict(self, samplers: Sequence[WindowSampler]) -> None:
+        """Step 4: predict the frames that wait in several batch items, window after window.
+
+        How many frames an item has, or had before, may differ.
+        """
+        while samplers := [sampler for sampler in samplers if sampler.waiting is not None]:
+            for sampler in samplers:
+                sampler.join(self.advance)
+            self._predict(samplers)
+            for sampler in samplers:
+                sampler.emit(self.lookahead_frames)
+
+    def _predict(self, samplers: Sequence[WindowSampler]) -> None:
+        """Predict one window of every batch item."""
+        net, features, device, count = self.model.net, self.model.features, self.device, self.window
+        frames = batched([sampler.frames for sampler in samplers if sampler.frames is not None], count)
+        predicted = batched([sampler.predicted for sampler in samplers], count)
+        number = torch.arange(count)
+        is_observed = number < torch.tensor([[sampler.final_count] for sampler in samplers])
+        valid = frames.valid & (number < torch.tensor([[sampler.count] for sampler in samplers]))
+        size = torch.stack([sampler.size for sampler in samplers])
+        head = features.condition(frames.R_world_head, frames.t_world_head, frames.floor_height, size, self.model.fps)
+        parts = head, frames.points, frames.points_valid, frames.image, frames.image_valid
+        conditions = Conditions(*(part.to(device) for part in parts))
+        # The last window's poses are re-expressed in this window's canonical frame, which may have moved.
+        observed = net.motion_normalizer(
+            features.encode(predicted.R_parent_joint, frames.R_world_head, predicted.foot_contact).to(device)
+        )
+        is_observed_on_device = is_observed.to(device)
+        x0 = sample(
+            self.denoiser(conditions, valid.to(device)),
+            predicted.noise.movedim(2, 0).to(device),
+            self.model.schedule,
+            eta=self.sampling.eta,
+            spacing=self.sampling.spacing,
+            observed=observed,
+            is_observed=is_observed_on_device if self.overlap.inpaint else None,
+        )
+        x0 = blended(x0, observed, is_observed_on_device, self.overlap.fade)
+        motion = net.motion_normalizer.inverse(x0.float()).cpu()
+        poses = [
+            torch.where(is_observed.reshape(*is_observed.shape, *[1] * (old.ndim - 2)), old, new)
+            for old, new in zip(predicted[:2], features.decode(motion, frames.R_world_head))
+        ]
+        for item, sampler in enumerate(samplers):
+            mine = (part[item : item + 1, : sampler.count] for part in (*poses, predicted.noise))
+            sampler.predicted = Predicted(*mine)
+
+    def _refined(self, path: HeadPath, samplers: Sequence[WindowSampler]) -> Motion:
         """Steps 5 and 6 of a whole recording."""
-        motion = self.motion(path.timestamps, path.skeleton, path.T_world_head, poses)
+        final = over_path(path, samplers)
+        motion = self.motion(final, path.skeleton)
         if self.refinement is not None:
-            measured = Measured.of(path.T_world_head, frames.floor_height[0])
-            motion = self.refinement.refined(motion, measured, path.stretches, self.model.fps, anchored=True)
+            motion = self.refinement.refined(motion, final.measured, path.stretches, self.fps, anchored=True)
         if len(path.stretches) == 1:
             return motion
         return anchored_to_head(_bridged(motion, path.stretches), path.T_world_head)
 
-    def motion(
-        self, timestamps: Float64[Tensor, "time"], skeleton: Skeleton, T_world_head: Rigid, poses: Poses
-    ) -> Motion:
-        """Step 5: poses (without the batch axis) as a motion that is anchored to the measured head."""
+    def motion(self, final: FinalPoses, skeleton: Skeleton) -> Motion:
+        """Step 5: predicted poses as a motion that is anchored to the measured head."""
         settings = {
             "pipeline": "hmd2",
             "steps": str(self.sampling.steps),
@@ -290,10 +268,7 @@ class HMD2(LearnedSystem):
             "lookahead": str(self.lookahead_frames),
             "refinement": str(self.refinement),
         }
-        contact = poses.foot_contact.repeat_interleave(2, -1) if self.model.features.contacts else None
-        root = torch.zeros(len(timestamps), 3)
-        motion = Motion(timestamps, skeleton, poses.R_parent_joint, root, contact, provenance=settings)
-        return anchored_to_head(motion, T_world_head)
+        return anchored_to_head(final.motion(skeleton, settings, self.model.features.contacts), final.T_world_head)
 
 
 def _bridged(motion: Motion, stretches: tuple[tuple[int, int], ...]) -> Motion:

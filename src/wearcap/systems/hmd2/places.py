@@ -1,5 +1,7 @@
-"""A stream's map of the points around its wearer: voxel grids for the model, and the floor below the head."""
+"""A wearer's map of the points around: voxel grids for the model, and the floor below the head."""
 
+import math
+import sys
 from dataclasses import dataclass
 
 import torch
@@ -29,6 +31,10 @@ class Memory:
             raise WearcapError(what, expected="at least 1000 points within at least 5 m")
 
 
+EVERYTHING = Memory(math.inf, sys.maxsize)
+"""Of a whole recording: nothing is dropped."""
+
+
 class Places:
     """Points around one wearer and the floor below, as seen so far."""
 
@@ -45,44 +51,46 @@ class Places:
         self._center: Tensor | None = None
         """Head position at which distant points were dropped last (m)."""
 
-    def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
-        """Add points (m) that were first seen at a time (s); points that are not finite are left out."""
+    def add(self, points_world: Float[Tensor, "point 3"], first_seen: Float64[Tensor, "point"] | None) -> None:
+        """Add points (m) with the times they were first seen (s), None: always; points that are not finite are left
+        out."""
         points = points_world.detach().float().cpu()
-        points = points[points.isfinite().all(-1)]
-        seen = torch.full((len(points),), first_seen, dtype=torch.float64)
-        self.mapped = True
+        finite, self.mapped = points.isfinite().all(-1), True
+        seen = torch.full((len(points),), -math.inf, dtype=torch.float64) if first_seen is None else first_seen
+        points, seen = points[finite], seen[finite]
         self.map.add(points, seen)
-        self._new.append((points, seen))
-        if len(self.map) <= MANY * self.memory.max_points:
-            return
-        # No frame arrives that would drop distant points: only the newest packets of new ones are kept.
-        kept, count = [], 0
-        while self._new and (not kept or count + len(self._new[-1][0]) <= self.memory.max_points):
-            kept.append(self._new.pop())
-            count += len(kept[-1][0])
-        self._new = kept[::-1]
-        self._begin([_joined(self._tracked)])
+        self._new.append(_joined([(points, seen)]))
+        if len(self.map) > MANY * self.memory.max_points:  # no frame arrives that would drop distant points
+            points, seen = _joined(self._new)
+            newest = slice(-self.memory.max_points, None)
+            self._rebuild(_joined(self._tracked), (points[newest], seen[newest]))
 
     def floor(
         self, timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]
     ) -> Float[Tensor, "time"]:
-        """Floor height (m) below the head at the next frames, updated as in `tracking.floor.tracked_floor`."""
+        """Floor height (m) below the head at the next frames, from the points and the path so far."""
         parts, done = [], 0
         while done < len(timestamps):
-            if self._floor.frames % LOOK_FRAMES == 0:  # the tracker gets the points that were seen by now
-                until = timestamps[done].item()
-                shown = [part for part in self._new if len(part[1]) and part[1][0] <= until]
-                if shown:
-                    self._new = [part for part in self._new if len(part[1]) and part[1][0] > until]
-                    self._tracked.append(_joined(shown))
-                    self._floor.see(self._tracked[-1][0])
-                if len(self._tracked) > 1000:
-                    self._tracked = [_joined(self._tracked)]
+            if self._floor.frames % LOOK_FRAMES == 0:
+                self._show(timestamps[done].item())
             ready = LOOK_FRAMES - self._floor.frames % LOOK_FRAMES
             parts.append(self._floor.follow(t_world_head[done : done + ready]))
             done += ready
         self._forget(t_world_head[-1])
         return torch.cat(parts)
+
+    def _show(self, until_s: float) -> None:
+        """Give the tracker the points that were seen by a time."""
+        if not self._new:
+            return
+        points, seen = _joined(self._new) if len(self._new) > 1 else self._new[0]
+        count = int(torch.searchsorted(seen, until_s, right=True))
+        self._new = [(points[count:], seen[count:])] if count < len(points) else []
+        if count:
+            self._tracked.append((points[:count], seen[:count]))
+            self._floor.see(points[:count])
+        if len(self._tracked) > 1000:
+            self._tracked = [_joined(self._tracked)]
 
     def _forget(self, t_world_head: Float[Tensor, "3"]) -> None:
         """Drop distant and old points once the wearer has walked far or there are too many points."""
@@ -94,20 +102,19 @@ class Places:
         points, seen = _joined(self._tracked)
         near = (points - t_world_head)[:, :2].norm(dim=-1) <= self.memory.radius_m
         newest = slice(-(self.memory.max_points // 2), None)
-        self._begin([(points[near][newest], seen[near][newest])])
+        self._rebuild((points[near][newest], seen[near][newest]), _joined(self._new))
 
-    def _begin(self, tracked: list[tuple[Tensor, Tensor]]) -> None:
-        """Replace the floor tracker's points by these, and the map by one of these and the new ones."""
-        self.map, self._tracked = VoxelMap(self.grid), tracked
+    def _rebuild(self, tracked: tuple[Tensor, Tensor], new: tuple[Tensor, Tensor]) -> None:
+        """Replace all points by these."""
+        self.map, self._tracked, self._new = VoxelMap(self.grid), [tracked], [new]
         self._floor.forget()
-        for points, seen in [*self._new, *tracked]:
+        self._floor.see(tracked[0])
+        for points, seen in (new, tracked):
             self.map.add(points, seen)
-        for points, _ in tracked:
-            self._floor.see(points)
 
 
 def _joined(parts: list[tuple[Tensor, Tensor]]) -> tuple[Float[Tensor, "point 3"], Float64[Tensor, "point"]]:
-    if not parts:
-        return torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)
-    points, seen = zip(*parts)
-    return torch.cat(points), torch.cat(seen)
+    """Points and times of several packets, in order of time."""
+    points, seen = zip(*parts) if parts else ((torch.zeros(0, 3),), (torch.zeros(0, dtype=torch.float64),))
+    times, order = torch.cat(seen).sort(stable=True)
+    return torch.cat(points)[order], times

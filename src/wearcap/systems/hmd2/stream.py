@@ -1,28 +1,99 @@
 """Streaming HMD²: sensor packets go in as they arrive, poses come out every `stride` frames (thesis eq. 6.5).
 
-Windows, noise and anchoring are those of `HMD2.capture`: with the same seed, and a pipeline that is `live` (its floor
-uses earlier data only), the poses are the same. Memory is bounded by a window and the points that are kept.
+Sensing, windows, noise and anchoring are those of `HMD2.capture`: with the same seed, and a pipeline that is `live` (its
+floor uses earlier data only), the poses are the same. Memory is bounded by a window and the points that are kept.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.recording.timing import joined
-from wearcap.runtime.session import Session
+from wearcap.runtime.session import HeadStream, Session
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
-from wearcap.sensors.packets import Admitted, time_fault
+from wearcap.sensors import packets
+from wearcap.sensors.packets import time_fault
 from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
-from wearcap.systems.hmd2.wearer import WearerState
-from wearcap.systems.hmd2.windows import advance
+from wearcap.systems.hmd2.sensing import Sensing
+from wearcap.systems.hmd2.windows import Frames, WindowSampler
 from wearcap.tracking.head_path import Chunk
+
+
+class HMD2Stream(HeadStream):
+    """One wearer of a session: checked packets that are not used yet, map, and windows."""
+
+    def __init__(self, pipeline: HMD2, wearer: Wearer, seed: int, memory: Memory):
+        super().__init__(pipeline, wearer, pipeline.advance, anchored=True)
+        self.seed, self.memory = seed, memory
+        self._begin()
+
+    def _begin(self) -> None:
+        super()._begin()
+        pipeline, stature = self.pipeline, self.wearer.skeleton.height_of("head")
+        self.sensing = Sensing(pipeline.model, pipeline.use, stature, self.memory)
+
+    def take(self, sample: Any) -> None:
+        if isinstance(sample, HeadSample):
+            self._admit(sample)
+        else:
+            self._head_input.refuse("head", packets.WRONG_TYPE)
+
+    def _checked(self, sample: HeadSample) -> HeadSample:
+        head, sensing, embedding = self._head_input, self.sensing, None
+        points = head.points(sample.points_world) if sensing.uses_points else None
+        if sensing.uses_images and sample.embedding is not None:
+            size = self.pipeline.model.net.image_size
+            if fault := packets.values_fault(sample.embedding, (size,), packets.MAX_FEATURE):
+                head.refuse("embedding", fault)
+                embedding = torch.full((size,), torch.nan)  # no image is used until the next valid one
+            else:
+                embedding = packets.owned(sample.embedding)
+        floor_m = sample.floor_height
+        if floor_m is not None and (fault := packets.number_fault(floor_m, packets.MAX_POSITION_M)):
+            head.refuse("floor height", fault)
+            floor_m = None
+        floor_m = None if floor_m is None else float(floor_m)
+        return HeadSample(float(sample.timestamp), head.pose(sample.T_world_device), points, embedding, floor_m)
+
+    def _accept(self, sample: HeadSample) -> None:
+        super()._accept(sample)
+        self.sensing.take(sample)
+
+    def _opened(self, chunk: Chunk) -> WindowSampler:
+        return self.pipeline.sampler(self.wearer.skeleton, self.seed, chunk.first)
+
+    def _sensed(self, chunk: Chunk, ended: bool) -> tuple[Frames]:
+        T_world_head = self._head_of(chunk.T_world_device)
+        return (self.sensing.frames(chunk.timestamps, chunk.T_world_device, T_world_head),)
+
+    def sense(self, ended: bool) -> bool:
+        """Give the windows the next chunk of the head's path; False: it is not complete."""
+        chunk = self._track.next(ended)
+        if chunk is not None:
+            self._push(chunk, ended)
+        return chunk is not None
+
+    def _advance(self, ended: bool) -> None:
+        advance([self], ended)
+
+
+@torch.inference_mode()
+def advance(streams: Sequence[HMD2Stream], ended: bool) -> None:
+    """Predict all frames whose chunks are complete; wearers share batches."""
+    while ready := [stream for stream in streams if stream.sense(ended)]:
+        pipeline = streams[0].pipeline
+        with pipeline.undisturbed():
+            pipeline.predict([stream.windows for stream in ready])
+        for stream in ready:
+            stream.emit()
+    for stream in streams if ended else ():
+        stream.emit(ended=True)
 
 
 class HMD2Session(Session):
@@ -42,7 +113,7 @@ class HMD2Session(Session):
             raise WearcapError(f"{len(seeds)} seeds for {len(wearers)} wearers", expected="one for each wearer")
         pipeline.prepare()
         memory = memory or Memory()
-        super().__init__(pipeline, [WearerState(pipeline, who, seed, memory) for who, seed in zip(wearers, seeds)])
+        super().__init__(pipeline, [HMD2Stream(pipeline, who, seed, memory) for who, seed in zip(wearers, seeds)])
         self.embedded = False
         """Whether an embedding of the right length has arrived."""
 
@@ -58,11 +129,8 @@ class HMD2Session(Session):
         Raises WearcapError for samples of another number of wearers and, without taking anything in, for an embedding
         of another length than the network's as long as none of the right length has arrived; later ones are refused.
         """
-        if len(samples) != len(self.streams):
-            expected = f"of {len(self.streams)}, as the session has"
-            raise WearcapError(f"samples of {len(samples)} wearers", expected=expected)
         wearers = zip(self.streams, samples) if not self.embedded else ()
-        for sample in (sample for state, part in wearers if state.shows_pictures for sample in part):
+        for sample in (sample for stream, part in wearers if stream.sensing.uses_images for sample in part):
             embedding, size = getattr(sample, "embedding", None), self.system.model.net.image_size
             if isinstance(embedding, Tensor) and embedding.shape == (size,):
                 self.embedded = True
@@ -71,62 +139,13 @@ class HMD2Session(Session):
                 when = "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"
                 expected = f"{size} of {self.system.model.image_encoder!r}, which the network was trained on"
                 raise WearcapError(f"an embedding of {len(embedding)} features at {when}", expected=expected)
-        for number, part in enumerate(samples):
-            for sample in part:
-                self._take(number, self.streams[number].admit(sample))
+        super().push(samples)
 
     def poses(self, ended: bool = False) -> list[Motion | None]:
-        begun = [number for number, state in enumerate(self.streams) if state.finished]
-        others = [number for number in range(len(self.streams)) if number not in begun]
-        for number in others if ended else ():
-            for _, sample in self.streams[number].door.end():
-                self.streams[number].take(sample)
-        motions = self._run(others, ended)
-        for number in begun:
-            motions[number] = joined(self.streams[number].finished)
-            self.streams[number].finished = []
-        return motions
-
-    def _take(self, number: int, admitted: Admitted) -> None:
-        """Process one wearer's accepted samples; at a reset of the clock the remaining poses are finished."""
-        state = self.streams[number]
-        if admitted.begins:
-            if admitted.again and (last := self._run([number], ended=True)[number]) is not None:
-                state.finished.append(last)
-            state.begin()
-        for _, sample in admitted.packets:
-            state.take(sample)
-
-    def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
-        """The next poses of some wearers; None for the others."""
-        predicted: list[list[Motion]] = [[] for _ in self.streams]
-        while chunks := {i: chunk for i in wearers if (chunk := self.streams[i].track.next(ended))}:
-            for i, chunk in chunks.items():
-                if chunk.begins:
-                    predicted[i] += self.streams[i].end()
-            with self.system.undisturbed():
-                self._advance(chunks)
-            for i in chunks:
-                predicted[i] += self.streams[i].finalize(self.system.lookahead_frames)
-        for i in wearers if ended else ():
-            predicted[i] += self.streams[i].end()
-        return [joined(parts) for parts in predicted]
-
-    @torch.inference_mode()
-    def _advance(self, chunks: dict[int, Chunk]) -> None:
-        """Sample the next chunk of some wearers, in one batch."""
-        samplers, fresh = [], []
-        for i, chunk in chunks.items():
-            state = self.streams[i]
-            T_device_head = Rigid(state.wearer.R_head_device, state.wearer.t_head_device).inverse()
-            fresh.append(state.frames(chunk, chunk.T_world_device @ T_device_head))
-            state.times = torch.cat([state.times, chunk.timestamps])
-            if chunk.begins or state.sampler is None:
-                state.sampler = self.system.sampler(state.wearer.skeleton, state.seed, chunk.first)
-            elif len(chunk.corrected.t):
-                state.sampler.correct(chunk.corrected @ T_device_head)
-            samplers.append(state.sampler)
-        advance(samplers, fresh)
+        for stream in self.streams if ended else ():
+            stream.end()
+        advance([stream for stream in self.streams if not stream.finished], ended)
+        return super().poses(ended)
 
 
 SESSION = HMD2Session

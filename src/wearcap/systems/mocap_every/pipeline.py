@@ -1,10 +1,9 @@
 """MocapEvery (Lee and Joo 2024): full-body motion from two watches and a head-mounted camera, on stairs and hills."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from einops import repeat
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,17 +19,18 @@ from wearcap.recording.timing import at_times
 from wearcap.runtime.graphs import Run, chosen, run_of
 from wearcap.runtime.needs import HEAD, HEIGHT, POINTS, WATCHES
 from wearcap.runtime.system import CaptureInput, LearnedSystem
+from wearcap.runtime.windows import FinalPoses, over_path
 from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
 from wearcap.sensors.watches import FILTER, watch_gaps, watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.visual_cues import VisualCues
-from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
+from wearcap.systems.mocap_every.windows import EstimatorWindows
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import CARRIED, floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
-from wearcap.tracking.refinement import Measured, Refinement, held_in_gaps
+from wearcap.tracking.refinement import Measured, Refinement, refined_over
 
 FLOORS = ("follow", "update", "points", "fixed")
 SETTINGS = ("stride", "lookahead", "floor", "carried", "anchor", "mirror_average")
@@ -137,40 +137,21 @@ class MocapEvery(LearnedSystem):
         path = head_path(recording, self.model.skeleton, self.model.fps)
         sensed = self._sensed(recording, path)
         # 2. end-effectors, contacts and poses, window by window; 3. floor height from the feet in contact
-        output = [self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
-        frames = path.held_frames  # in the gaps between stretches the last pose goes on, at the interpolated head
-        whole = FinalPoses(*(torch.cat(part)[frames] for part in zip(*output)))
-        poses = path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root
-        contact_prob = repeat(whole.contact_prob, "time foot -> time (foot patch)", patch=2)
-        gaps = watch_gaps(recording.imu, path.timestamps)
-        about = self.settings() | ({"note": "; ".join(gaps)} if gaps else {})
-        motion = Motion(*poses, contact_prob, provenance=about)
+        whole = self._estimated(recording, path, sensed)
         # 4. anchor the body to the measured head
-        if self.anchor:
-            motion = anchored_to_head(motion, path.T_world_head)
+        motion = self.motion(whole, path.skeleton)
+        if gaps := watch_gaps(recording.imu, path.timestamps):
+            motion = replace(motion, provenance=motion.provenance | {"note": "; ".join(gaps)})
         # 5. smooth it, hold its feet, and bend its arms to tracked hands
-        if self.refinement is not None:
-            motion = self._refined(motion, self.refinement, path, sensed, whole.floor_height)
+        tracked = self.model.features.wrists == "positions"
+        hands = Rigid(sensed.R_world_wrist, sensed.t_world_wrist) if tracked else None
+        measured = Measured.of(path.T_world_head, whole.floor_height, hands)
+        motion = refined_over(self.refinement, motion, measured, path, self.fps, self.anchor)
         # 6. edit the motion within the manifold to fit the visual cues
         edits: list[LatentSolution] = []
         if self.cues is not None:
             motion, edits = self.cues.edit(motion, recording, path.T_world_head)
         return CapturedWithFloor(motion, FloorTrack(path.timestamps, whole.floor_height), edits)
-
-    def _refined(
-        self,
-        motion: Motion,
-        refinement: Refinement,
-        path: HeadPath,
-        sensed: Sensed,
-        floor_height: Float[Tensor, "time"],
-    ) -> Motion:
-        """Step 5; the frames between stretches keep the refined pose before them."""
-        tracked = self.model.features.wrists == "positions"
-        hands = Rigid(sensed.R_world_wrist, sensed.t_world_wrist) if tracked else None
-        measured = Measured.of(path.T_world_head, floor_height, hands)
-        motion = refinement.refined(motion, measured, path.stretches, self.model.fps, self.anchor)
-        return motion if len(path.stretches) == 1 else held_in_gaps(motion, path, self.anchor)
 
     def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
         """All metrics in the world, without anchoring or alignment (MocapEvery §4.1)."""
@@ -198,39 +179,34 @@ class MocapEvery(LearnedSystem):
             )
         return Sensed(R, t, *watches_at(recording.imu, path.timestamps, recording.name), torch.zeros(len(t), 2, 3))
 
-    def _capture_stretch(
-        self, recording: Recording, path: HeadPath, sensed: Sensed, start: int, stop: int
-    ) -> FinalPoses:
-        """Run the sliding windows over the path's frames from `start` to `stop`."""
-        if (track := recording.floor) is not None:  # the measured floor, the paper's h_0
-            begin = path.timestamps[start : start + 1]
-            initial_m = interpolate_clamped(track.timestamps, track.height, begin).item()
-        else:
-            initial_m = path.floor_below(self.carried)[start].item()
-        floor, floor_height = self.follower(path.skeleton, initial_m), None
+    def _estimated(self, recording: Recording, path: HeadPath, sensed: Sensed) -> FinalPoses:
+        """Steps 2 and 3: sliding windows over every stretch of a recording."""
+        initial_m, known_m, cloud, track = path.floor_below(self.carried), None, recording.points, recording.floor
         if self.floor == "points":  # below the head; from the head path where there are too few points
-            height = floor_from_points(recording.points, path.T_world_head.t, path.stature)
-            floor_height = path.floor_below(self.carried) if height is None else height
-        cloud = recording.points if self.floor in ("follow", "update") else None
-        if cloud is not None and cloud.first_seen is None:
-            floor.see(cloud.points_world)
-        windows, parts, seen_until = EstimatorWindows(self, path.skeleton, floor), [], -torch.inf
-        for first in range(start, stop, self.stride):
-            last = min(first + self.stride, stop)
-            if cloud is not None and (when := cloud.first_seen) is not None:
-                until = path.timestamps[last - 1].item()
-                fresh, seen_until = (when > seen_until) & (when <= until), until
-                if fresh.any():
-                    floor.see(cloud.points_world[fresh])
-            if floor_height is not None:
-                assert isinstance(floor, FloorFixed)
-                floor.height = floor_height[first].item()
-            parts.append(windows.advance(Sensed(*(part[first:last] for part in sensed))))
-        parts.append(windows.finish())
-        return FinalPoses(*(torch.cat(part) for part in zip(*parts)))
+            known_m = floor_from_points(cloud, path.T_world_head.t, path.stature)
+            known_m = initial_m if known_m is None else known_m
+        if track is not None:  # the measured floor, the paper's h_0
+            initial_m = interpolate_clamped(track.timestamps, track.height, path.timestamps)
+        stretches = []
+        for start, stop in path.stretches:
+            windows, part = self.windows(path.skeleton, initial_m[start].item()), slice(start, stop)
+            if cloud is not None and self.floor in ("follow", "update"):
+                windows.see(cloud.points_world, cloud.first_seen)
+            inputs = path.timestamps[part], Sensed(*(field[part] for field in sensed))
+            windows.push(*inputs, None if known_m is None else known_m[part])
+            stretches.append(windows)
+        return over_path(path, stretches)
 
-    def follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:
-        """Floor follower of the configured kind, with an initial height (m)."""
+    def windows(self, skeleton: Skeleton, floor_m: float) -> EstimatorWindows:
+        """Windows over a stretch that begins at a height of the floor (m), with a follower of the configured kind."""
+        return EstimatorWindows(self, skeleton, self._follower(skeleton, floor_m))
+
+    def motion(self, final: FinalPoses, skeleton: Skeleton) -> Motion:
+        """Step 4: estimated poses as a motion, anchored to the measured head."""
+        motion = final.motion(skeleton, self.settings())
+        return anchored_to_head(motion, final.T_world_head) if self.anchor else motion
+
+    def _follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:
         if self.floor == "update":
             return FloorUpdate(initial_m)
         if self.floor == "follow":
