@@ -418,6 +418,11 @@ def detected(motion: Motion, tmp_path, **settings) -> IReplica:
     return IReplica(Registered(), None, tracker(), DetectedContacts(tmp_path, **given), fps=FPS)
 
 
+def test_a_pipeline_without_a_network_exports_nothing():
+    with pytest.raises(WearcapError, match="0 contact networks"):
+        IReplica(Registered(), None, tracker(), None).exports()
+
+
 def filmed(motion: Motion) -> Recording:
     camera = Camera.pinhole(640, 480, 70.0)
     return Recording("r", suit=motion, camera=CameraStream(motion.timestamps, camera, torch.eye(3), torch.zeros(3)))
