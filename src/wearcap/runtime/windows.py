@@ -127,7 +127,8 @@ class StretchWindows(Window[Frames], ABC):
         part, frames = self.finalize(lookahead), cast(Any, self.frames)
         if part.stop > part.start:
             measured = frames.timestamps, frames.R_world_head, frames.t_world_head, frames.floor_height
-            self._final.append(FinalPoses(*(field[0, part] for field in measured), *self._poses(part)))
+            fields = *(field[0, part] for field in measured), *self._poses(part)
+            self._final.append(FinalPoses(*(field.clone() for field in fields)))  # which lets go of the window
 
     def take(self, ended: bool = False) -> FinalPoses | None:
         """Frames that were put out since the last call, or None; `ended`: with all others, as none will follow."""
