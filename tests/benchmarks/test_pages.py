@@ -270,7 +270,7 @@ def test_a_page_is_one_table_and_what_a_person_reads(system):
 def test_all_prints_every_table_of_the_json(system, capsys):
     command.main([system, "--all"])
     shown = capsys.readouterr().out
-    trees = command.results(system, command.SYSTEMS)
+    trees = command.pages.results(system, command.SYSTEMS)
     assert trees
     for tree in trees.values():
         for title, rows in tree.get("tables", {}).items():
