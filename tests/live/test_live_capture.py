@@ -517,9 +517,9 @@ def test_a_replay_of_an_export_has_wrists_and_no_controllers_also_with_a_height(
     monkeypatch.setattr(command, "LiveCapture", lambda *_, **settings: given.update(settings) or ran)
     save_recording(carried(), tmp_path / "in.safetensors")
     command.main(["model.onnx", "--recording", str(tmp_path / "in.safetensors"), "--height", "1.8"])
-    assert (given["hands"], given["setup"]) == ("joint", None)
+    assert (given["known"].hands, given["known"].setup) == ("joint", None)
     command.main(["model.onnx", "--source", "vmc://:39540"])
-    assert given["hands"] == "grip"
+    assert given["known"].hands == "grip"
 
 
 @pytest.mark.slow
