@@ -17,6 +17,7 @@ from wearcap.export import files
 from wearcap.export.files import RUN_BY_FORMAT, load_exported, open_exported
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
+from wearcap.models.layers import TransformerSize
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import CameraStream, HeadStream, PointCloud, Recording
 from wearcap.recording.store import RecordingFile, save_recording
@@ -52,10 +53,7 @@ def pipeline() -> HMD2:
         features.motion_size,
         features.condition_size,
         WINDOW,
-        width=32,
-        layers=1,
-        heads=2,
-        feedforward=64,
+        TransformerSize(32, 1, 2, 64, 0.1),
         frames_per_token=2,
         blend=5,
         points_size=places.size,

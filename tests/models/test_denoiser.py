@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.models.layers import Normalizer
+from wearcap.models.layers import Normalizer, TransformerSize
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
 
 
 def small(**changes) -> MotionDenoiser:
-    settings = {"motion_size": 12, "condition_size": 5, "window": 16, "width": 32, "layers": 2, "heads": 4}
-    net = MotionDenoiser(**settings | {"feedforward": 64, "dropout": 0.0} | changes)
+    settings = {"motion_size": 12, "condition_size": 5, "window": 16}
+    net = MotionDenoiser(**settings, transformer=TransformerSize(32, 2, 4, 64, 0.0), **changes)
     for parameter in net.parameters():  # zero-initialised gates would hide what the blocks do
         torch.nn.init.normal_(parameter, std=0.1)
     return net.eval()

@@ -9,6 +9,7 @@ from test_hmd2_stream import IMAGE, WINDOW, moments, stream, surrounded, wearer
 from bad_packets import TIMES, VECTORS, Mutator, bad_poses, unchecked
 from small_hmd2 import hmd2_of
 from wearcap.errors import WearcapError
+from wearcap.models.layers import TransformerSize
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import Motion
 from wearcap.systems.hmd2 import sensing
@@ -30,11 +31,7 @@ def hmd2():
         features.motion_size,
         features.condition_size,
         WINDOW,
-        32,
-        1,
-        4,
-        64,
-        0.0,
+        TransformerSize(32, 1, 4, 64, 0.0),
         4,
         blend=5,
         points_size=places.size,

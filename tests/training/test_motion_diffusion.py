@@ -8,10 +8,12 @@ from wearcap.body.skeleton import xsens23
 from wearcap.data.windows import Source, Windows, collate
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
+from wearcap.models.layers import TransformerSize
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.training import MotionDiffusion
 from wearcap.systems.hmd2.training_windows import HeadContent
+from wearcap.training.base import Optimization
 from wearcap_testing import small_dataset
 
 
@@ -35,12 +37,14 @@ def system(batch, level_tilt: float, pure: float = 0.0) -> MotionDiffusion:
     features = HeadFeatures()
 
     def net(motion_size, condition_size, points_size, image_size):
-        plain = MotionDenoiser(motion_size, condition_size, 60, 32, 1, 4, 32, 0.0, 4)
+        plain = MotionDenoiser(motion_size, condition_size, 60, TransformerSize(32, 1, 4, 32, 0.0), 4)
         return Spy(plain, features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact))
 
     weights = {"motion": 1.0, "joints": 1.0, "velocity": 1.0}
     levels = {"level_tilt": level_tilt, "pure": pure}
-    return MotionDiffusion(net, features, CosineSchedule(), xsens23(), 60.0, weights, torch.optim.AdamW, **levels)
+    return MotionDiffusion(
+        net, features, CosineSchedule(), xsens23(), 60.0, weights, Optimization(torch.optim.AdamW), **levels
+    )
 
 
 def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_path):

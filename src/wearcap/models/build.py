@@ -38,6 +38,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.model": ("MotionDenoiser",),
     "wearcap.systems.echo.model": ("EchoDenoiser",),
     "wearcap.models.image_encoder": ("EgoViewEncoder",),
+    "wearcap.models.layers": ("TransformerSize",),
     "wearcap.models.motion_autoencoder": ("MotionAutoencoder",),
     "wearcap.systems.mocap_every.manifold": ("MotionManifold",),
     "wearcap.models.point_encoder": ("ObjectNetwork", "PointNeXt"),
@@ -47,6 +48,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.ireplica.training": ("ContactDetection",),
     "wearcap.systems.echo.training": ("EchoDiffusion",),
     "wearcap.systems.hmd2.egoview_training": ("EgoView",),
+    "wearcap.training.base": ("Optimization",),
     "wearcap.training.motion_autoencoder": ("MotionEncoding",),
     "wearcap.systems.hmd2.training": ("MotionDiffusion",),
     "wearcap.systems.mocap_every.manifold_training": ("ManifoldTraining",),
@@ -67,6 +69,15 @@ RENAMED = {"wearcap.diffusion.levels.LevelMix": {"whole": "fully_observed"}}
 """Settings that files of before have under another name, by target."""
 STRUCK = {"object_in_wrists": False}
 """Settings that went, with the value at which files of before have them and do without."""
+
+_TRANSFORMER = {"transformer": ("wearcap.models.layers.TransformerSize", "width layers heads feedforward dropout")}
+GROUPED: dict[str, dict[str, tuple[str, str]]] = {
+    "wearcap.systems.hmd2.model.MotionDenoiser": _TRANSFORMER,
+    "wearcap.systems.echo.model.EchoDenoiser": _TRANSFORMER,
+    "wearcap.systems.mocap_every.model.TwoStageEstimator": _TRANSFORMER,
+}
+"""Settings that files of before have side by side: by target and group, the group's class and their names."""
+_OPTIMIZATION = {"optimization": ("wearcap.training.base.Optimization", "optimizer scheduler seed")}
 
 _BY_NAME = {f"{module}.{name}": (module, name) for module, names in TARGETS.items() for name in names}
 _TARGET, _PARTIAL = "_target_", "_partial_"
@@ -96,6 +107,12 @@ def brought_up_to_date(config: Any) -> None:
                 for old, new in RENAMED.get(target, {}).items():
                     if old in value:
                         value[new] = value.pop(old)
+                groups = GROUPED.get(target, {}) | (
+                    {} if "optimizer" not in value or name == "Optimization" else _OPTIMIZATION
+                )
+                for group, (kind, names) in groups.items():
+                    if found := {old: value.pop(old) for old in names.split() if old in value}:
+                        value[group] = {_TARGET: kind} | found
             for name in [name for name, off in STRUCK.items() if name in value and value[name] is off]:
                 del value[name]
         rest += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
@@ -177,7 +194,8 @@ def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where:
 def target_of(name: str) -> Callable[..., Any]:
     """The class or function of a `_target_` of `TARGETS`."""
     module, attribute = _BY_NAME[name]
-    return getattr(importlib.import_module(module), attribute)
+    with torch.device("cpu"):  # constants of a module that is imported in a rehearsal have values
+        return getattr(importlib.import_module(module), attribute)
 
 
 def _made(value: Any) -> Any:

@@ -16,6 +16,7 @@ from wearcap.models.layers import (
     MotionEncoder,
     Normalizer,
     TemporalBlend,
+    TransformerSize,
     Widening,
     attention_mask,
     denoiser_block,
@@ -101,12 +102,8 @@ class MotionDenoiser(nn.Module):
         self,
         motion_size: int,
         condition_size: int,
-        window: int = 240,
-        width: int = 512,
-        layers: int = 8,
-        heads: int = 8,
-        feedforward: int = 1024,
-        dropout: float = 0.1,
+        window: int,
+        transformer: TransformerSize,
         frames_per_token: int = 1,
         blend: int = 0,
         context: int = 14,
@@ -119,7 +116,7 @@ class MotionDenoiser(nn.Module):
         super().__init__()
         if window % frames_per_token:
             raise ValueError(f"a window of {window} frames does not split into tokens of {frames_per_token}")
-        self.window, self.frames_per_token = window, frames_per_token
+        self.window, self.frames_per_token, width = window, frames_per_token, transformer.width
         self.motion_size, self.condition_size = motion_size, condition_size
         self.points_size, self.image_size = points_size, image_size
         self.self_conditioning = self_conditioning
@@ -130,8 +127,7 @@ class MotionDenoiser(nn.Module):
         self.motion_encoder = MotionEncoder(motion_size * (2 if self_conditioning else 1), width, frames_per_token)
         self.level = LevelEmbedding(width)
         self.blocks = nn.ModuleList(
-            denoiser_block(mixing, width, heads, feedforward, window // frames_per_token, dropout)
-            for _ in range(layers)
+            denoiser_block(mixing, transformer, window // frames_per_token) for _ in range(transformer.layers)
         )
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, frames_per_token * motion_size)

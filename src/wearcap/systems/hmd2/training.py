@@ -17,7 +17,7 @@ from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel
 from wearcap.systems.hmd2.training_windows import HeadContent, HeadWindow
 from wearcap.training import losses
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 
 CONTACT_LOGIT = 4.0
 """Logit of a contact whose predicted feature is 1; features of contacts are from -1 to 1."""
@@ -47,8 +47,7 @@ class MotionDiffusion(Training):
         skeleton: Skeleton,
         fps: float,
         loss_weights: dict[str, float],
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
+        optimization: Optimization,
         level_tilt: float = 0.0,
         pure: float = 0.0,
         drop: float = 0.0,
@@ -57,12 +56,11 @@ class MotionDiffusion(Training):
         place_encoder: VoxelAutoencoder | None = None,
         image_encoder: str | None = None,
         image_size: int = 0,
-        seed: int = 0,
         compile: bool = False,
     ):
         """`place_encoder` (frozen, thesis §6.2) encodes the points; `image_encoder` names the encoder of the image
         embeddings, `image_size` features each. None leaves that modality out."""
-        super().__init__(optimizer, scheduler, loss_weights, seed)
+        super().__init__(optimization, loss_weights)
         if not 0 <= pure < 1:
             raise WearcapError(f"a share pure={pure} of the windows", expected="from 0 to less than 1")
         self.net = net(
