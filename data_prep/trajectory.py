@@ -34,7 +34,7 @@ def trajectory_tasks(
         found = [source]
     if not found:
         raise WearcapError("no trajectory in this folder", source, "a file that wearcap doctor knows as one")
-    if len(found) > 1 and (settings.files() or settings.video):
+    if len(found) > 1 and (settings.files() or settings.video.video):
         what = f"{len(found)} trajectories, but points, video or head_imu of one"
         raise WearcapError(what, where=source, fix="Prepare that one alone: source=FILE.")
     files = settings.files()
