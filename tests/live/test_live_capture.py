@@ -131,7 +131,7 @@ def test_at_its_own_pace_poses_leave_after_the_systems_latency():
     assert time.monotonic() - begin_s > sensed.head.timestamps[-1].item()
     latency = report["wearers"]["wearer"]["latency_ms"]
     # The quickest packet's delay counts as none; frames of a stride but the first wait for less than the system's.
-    assert latency["of_the_system"] - 1000 * system.stride / system.fps < latency["median"]
+    assert latency["of_the_system"] - 1000 * system.overlap.stride / system.fps < latency["median"]
 
 
 class Scripted(Source):
