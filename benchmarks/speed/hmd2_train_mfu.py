@@ -62,9 +62,9 @@ class _Training:
         config = compose(
             "train", [f"experiment={EXPERIMENTS['full']}", "surroundings=head", f"model.compile={compile}"]
         )
-        places = VoxelAutoencoder()
+        points, image = {"encoder": VoxelAutoencoder()}, {"size": IMAGE, "encoder": "any"}
         self.system: MotionDiffusion = instantiate(
-            config.model, place_encoder=places, image_encoder="any", image_size=IMAGE, _convert_="all"
+            config.model, conditions={"points": points, "image": image}, _convert_="all"
         ).to(device)
         self.system.train()
         self.optimizer = torch.optim.AdamW(self.system.net.parameters(), fused=device == "cuda")
@@ -92,10 +92,8 @@ def _windows(batch: int, time_steps: int = 240, joints: int = 23) -> HeadWindow:
         t_parent_joint=0.2 * torch.randn(batch, joints, 3),
         size=torch.ones(batch, len(LIMBS)),
         foot_contact=torch.rand(*shape, 2).round(),
-        points=torch.randn(*shape, VoxelAutoencoder().size),
-        points_valid=there,
-        image=torch.randn(*shape, IMAGE),
-        image_valid=there,
+        others=torch.randn(*shape, VoxelAutoencoder().size + IMAGE),
+        given=there[..., None].expand(-1, -1, 2),
         noise=torch.randn(*shape, 6 * joints + 2),
         level=torch.rand(batch, 1),
         chance=torch.rand(batch, 3),

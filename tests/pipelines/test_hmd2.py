@@ -31,8 +31,7 @@ def pipeline(frame: str = "heading", **changes) -> HMD2:
         60,
         TransformerSize(32, 1, 4, 64, 0.0),
         4,
-        points_size=places.size,
-        image_size=IMAGE_SIZE,
+        conditions={"points": places.size, "image": IMAGE_SIZE},
     )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)

@@ -48,8 +48,7 @@ def pipeline(places):
             TransformerSize(32, 1, 4, 64, 0.0),
             4,
             blend=5,
-            points_size=places.size if points else 0,
-            image_size=IMAGE if points else 0,
+            conditions={"points": places.size, "image": IMAGE} if points else {},
         )
         for parameter in net.parameters():
             torch.nn.init.normal_(parameter, std=0.05)

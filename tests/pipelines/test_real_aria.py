@@ -187,7 +187,7 @@ def hmd2() -> HMD2:
         60,
         TransformerSize(32, 1, 4, 64, 0.0),
         4,
-        points_size=places.size,
+        conditions={"points": places.size},
     )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)

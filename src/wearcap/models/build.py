@@ -50,7 +50,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.egoview_training": ("EgoView",),
     "wearcap.training.base": ("Optimization",),
     "wearcap.training.motion_autoencoder": ("MotionEncoding",),
-    "wearcap.systems.hmd2.training": ("MotionDiffusion",),
+    "wearcap.systems.hmd2.training": ("Levels", "Loss", "MotionDiffusion"),
     "wearcap.systems.mocap_every.manifold_training": ("ManifoldTraining",),
     "wearcap.systems.echo.object_training": ("ObjectEncoding",),
     "wearcap.systems.hmd2.pose_regressor.training": ("PoseRegression",),
@@ -65,16 +65,23 @@ TARGETS: dict[str, tuple[str, ...]] = {
 
 MOVED = {"wearcap.systems.hmd2.point_codes_training": "wearcap.systems.hmd2.voxel_autoencoder_training"}
 """Modules that files of before name, and where their classes are now."""
-RENAMED = {"wearcap.diffusion.levels.LevelMix": {"whole": "fully_observed"}}
+_DIFFUSION = "wearcap.systems.hmd2.training.MotionDiffusion"
+RENAMED = {
+    "wearcap.diffusion.levels.LevelMix": {"whole": "fully_observed"},
+    _DIFFUSION: {"level_tilt": "tilt", "loss_weights": "weights"},
+}
 """Settings that files of before have under another name, by target."""
 STRUCK = {"object_in_wrists": False}
 """Settings that went, with the value at which files of before have them and do without."""
 
+_NETWORKS = ("hmd2.model.MotionDenoiser", "echo.model.EchoDenoiser", "mocap_every.model.TwoStageEstimator")
 _TRANSFORMER = {"transformer": ("wearcap.models.layers.TransformerSize", "width layers heads feedforward dropout")}
 GROUPED: dict[str, dict[str, tuple[str, str]]] = {
-    "wearcap.systems.hmd2.model.MotionDenoiser": _TRANSFORMER,
-    "wearcap.systems.echo.model.EchoDenoiser": _TRANSFORMER,
-    "wearcap.systems.mocap_every.model.TwoStageEstimator": _TRANSFORMER,
+    **{f"wearcap.systems.{name}": _TRANSFORMER for name in _NETWORKS},
+    _DIFFUSION: {
+        "levels": ("wearcap.systems.hmd2.training.Levels", "tilt pure"),
+        "loss": ("wearcap.systems.hmd2.training.Loss", "weights tail contact_share"),
+    },
 }
 """Settings that files of before have side by side: by target and group, the group's class and their names."""
 _OPTIMIZATION = {"optimization": ("wearcap.training.base.Optimization", "optimizer scheduler seed")}
@@ -110,12 +117,23 @@ def brought_up_to_date(config: Any) -> None:
                 groups = GROUPED.get(target, {}) | (
                     {} if "optimizer" not in value or name == "Optimization" else _OPTIMIZATION
                 )
+                if target == _DIFFUSION and "place_encoder" in value:
+                    value["conditions"] = _conditions(*(value.pop(old) for old in _CONDITIONS))
                 for group, (kind, names) in groups.items():
                     if found := {old: value.pop(old) for old in names.split() if old in value}:
                         value[group] = {_TARGET: kind} | found
             for name in [name for name, off in STRUCK.items() if name in value and value[name] is off]:
                 del value[name]
         rest += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+
+
+_CONDITIONS = ("place_encoder", "image_encoder", "image_size", "drop")
+
+
+def _conditions(places: Any, images: Any, size: Any, drop: Any) -> dict[str, Any]:
+    """HMD²'s conditions beside the head from the settings that it had for points and images."""
+    points = {"points": {"encoder": places, "drop": drop}} if places else {}
+    return points | ({"image": {"encoder": images, "size": size, "drop": drop}} if images else {})
 
 
 def check_config(config: Any, where: str | Path) -> None:
