@@ -10,7 +10,7 @@ from data_prep.shared.engine import Splits, Task
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO
-from wearcap.prepare.logs import TrajectorySettings, log_name, read_path
+from wearcap.prepare.logs import Evidence, HeadVideo, Outliers, TrajectorySettings, log_name, read_path
 from wearcap.reading.any_file import of_name
 from wearcap.reading.kinds import known
 from wearcap.recording.recording import Recording
@@ -54,9 +54,10 @@ def trajectory_tasks(
     Raises WearcapError where there is none, and for points, a video or an inertial log of several trajectories.
     """
     source = Path(source)
-    evidence = points, standing, camera_height_m, head_imu, T_cam_imu, walks
-    path, clean = (up, axes, time_unit, fps, unit, T_head_device, height), (max_acceleration, max_burst_s)
-    settings = TrajectorySettings(*path, *evidence, video, camera, video_start_s, *clean)
+    evidence = Evidence(points, standing, camera_height_m, head_imu, T_cam_imu, walks)
+    clean = Outliers(max_acceleration, max_burst_s)
+    path = up, axes, time_unit, fps, unit, T_head_device, height
+    settings = TrajectorySettings(*path, evidence, HeadVideo(video, camera, video_start_s), clean)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
     kinds, found = [*of_name("trajectory"), *of_name("MPS")], [source]
@@ -64,7 +65,7 @@ def trajectory_tasks(
         found = [path for path in sorted(source.iterdir()) if known(path, kinds)]
     if not found:
         raise WearcapError("no trajectory in this folder", source, "a file that wearcap doctor knows as one")
-    if len(found) > 1 and (settings.files() or settings.video):
+    if len(found) > 1 and (settings.files() or settings.video.video):
         what = f"{len(found)} trajectories, but points, video or head_imu of one"
         raise WearcapError(what, where=source, fix="Prepare that one alone: source=FILE.")
     files = settings.files()

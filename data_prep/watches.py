@@ -33,7 +33,9 @@ def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesS
         found = read_watch_calibration(settings.calibration)
         slam = read.trajectory
         if found.camera is not None:
-            slam, kept, _ = clean_track(slam, float(way.max_acceleration) / found.camera.scale, float(way.max_burst_s))
+            slam, kept, _ = clean_track(
+                slam, float(way.outliers.max_acceleration) / found.camera.scale, float(way.outliers.max_burst_s)
+            )
             notes += [f"{int((~kept).sum())} outliers of {len(kept)} camera poses removed"] if not kept.all() else []
         recording = WatchSession(watches, slam).added_to(recording, found)
         notes.append(f"calibrated by {Path(settings.calibration).name}")

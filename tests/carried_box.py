@@ -15,6 +15,7 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import write_environment
+from wearcap.models.layers import TransformerSize
 from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording, RecordingStore
 from wearcap.recording.active_objects import true_spans
 from wearcap.recording.motion import Interactions
@@ -98,9 +99,9 @@ def small_features(frame: str = "own", **changes) -> EchoFeatures:
 def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
     """A network with random weights, and statistics with which any output is a valid pose."""
     torch.manual_seed(0)
-    sizes = (features.human_size, OBJECT_SIZE, CONTACTS, features.condition_size, features.object_condition_size)
-    settings = {"window": WINDOW, "width": 32, "layers": 1, "heads": 2, "feedforward": 32, "dropout": 0.0}
-    net = EchoDenoiser(*sizes, **settings | changes)
+    sizes = (features.human_size, OBJECT_SIZE, CONTACTS)
+    settings = {"window": WINDOW, "transformer": TransformerSize(32, 1, 2, 32, 0.0)}
+    net = EchoDenoiser(sizes, features.condition_size, features.object_condition_size, **settings | changes)
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     mean, scale = torch.zeros(sum(net.sizes)), torch.full((sum(net.sizes),), 0.5)

@@ -23,10 +23,10 @@ SMALL = [
     "debug=fast",
     "data.dataset.window=60",
     "trainer.accelerator=cpu",
-    "model.net.width=32",
-    "model.net.layers=1",
-    "model.net.heads=4",
-    "model.net.feedforward=32",
+    "model.net.transformer.width=32",
+    "model.net.transformer.layers=1",
+    "model.net.transformer.heads=4",
+    "model.net.transformer.feedforward=32",
     "trainer.enable_progress_bar=false",
     "trainer.enable_model_summary=false",
     "callbacks.progress=null",
@@ -167,7 +167,7 @@ ROWS = {
         "Did you mean 'trainer.max_steps'",
     ),
     "train: a value the model refuses": (
-        lambda data, ckpt, tmp, out: training(data, out, "model.net.width=191"),
+        lambda data, ckpt, tmp, out: training(data, out, "model.net.transformer.width=191"),
         "cannot build model: width 191 must be",
     ),
     "train: resume": (

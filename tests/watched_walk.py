@@ -4,21 +4,24 @@ import torch
 
 from walking_person import SEAT, inertial, room, walk
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
+from wearcap.models.layers import TransformerSize
 from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import TwoStageEstimator
-from wearcap.systems.mocap_every.pipeline import MocapEvery, WatchModel
+from wearcap.systems.mocap_every.pipeline import MocapEvery, Overlap, WatchModel
 
 WINDOW, FPS = 16, 30.0
+SIZE = TransformerSize(32, 1, 2, 32, 0.0)
 
 
 def drawn_pipeline(multi_stage: bool = True, **settings) -> MocapEvery:
     """A small pipeline whose network has drawn weights."""
     torch.manual_seed(0)
     features = WatchFeatures("heading", body=True)
-    net = TwoStageEstimator(features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 16, 0.0, multi_stage, 2)
-    given = {"stride": 4, "lookahead": 8, **settings}
-    return MocapEvery(WatchModel(net.eval(), features, xsens23(), FPS), **given)
+    net = TwoStageEstimator(features.size, features.motion_size, WINDOW, SIZE, 16, multi_stage, 2)
+    how = {"stride": 4, "lookahead": 8, "mirror_average": True}
+    overlap = Overlap(**{name: settings.pop(name, value) for name, value in how.items()})
+    return MocapEvery(WatchModel(net.eval(), features, xsens23(), FPS), overlap, **settings)
 
 
 def watched_walk(seconds: float = 4.0, watch_hz: float = 100.0) -> Recording:

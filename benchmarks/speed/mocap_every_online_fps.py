@@ -28,11 +28,11 @@ NEW_POINTS = 150
 def measure(duration_s: float = 30.0, repeats: int = 3) -> list[dict]:
     pipeline, recording, rows = pipeline_of("mocap_every_online"), watched(duration_s), []
     for name, stride, points in (
-        ("", pipeline.stride, True),
+        ("", pipeline.overlap.stride, True),
         ("_each_frame", 1, True),
-        ("_given_floor", pipeline.stride, False),
+        ("_given_floor", pipeline.overlap.stride, False),
     ):
-        stepping = replace(pipeline, stride=stride)
+        stepping = replace(pipeline, overlap=replace(pipeline.overlap, stride=stride))
         with undisturbed(pipeline.runtime == "onnx"):
             rates = sorted(_rate(stepping, recording, points) for _ in range(repeats))
         rows.append(per_second(f"mocap_every_online{name}_fps", rates[repeats // 2], 30.0, 10.0))

@@ -15,10 +15,12 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.runtime.wearer import Wearer
+from wearcap.systems.hmd2.conditions import Images, Points
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel
+from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
+from wearcap.systems.hmd2.windows import DiffusionModel
 
 EXPERIMENTS = {"small": "hmd2", "full": "full/hmd2"}
 """Experiments of both sizes; where there is a checkpoint, it has the same name."""
@@ -37,7 +39,8 @@ def pipeline_of(size: str) -> HMD2:
         assert isinstance(pipeline, HMD2)
     else:
         net = random_net(size)
-        model = DiffusionModel(net, _FEATURES, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any")
+        conditions = {"points": Points(VoxelAutoencoder()), "image": Images(IMAGE, "any")}
+        model = DiffusionModel(net, _FEATURES, CosineSchedule(), xsens23(), 60.0, conditions)
         pipeline = instantiate(config, _convert_="all")(model=model, device="cpu")
         count = sum(parameter.numel() for parameter in net.parameters()) / 1e6
         print(f"no checkpoint {EXPERIMENTS[size]!r}: random weights, {count:.1f} M parameters", file=sys.stderr)
@@ -54,8 +57,7 @@ def random_net(size: str) -> MotionDenoiser:
     net = instantiate(config.model.net)(
         motion_size=_FEATURES.motion_size,
         condition_size=_FEATURES.condition_size,
-        points_size=VoxelAutoencoder().size,
-        image_size=IMAGE,
+        conditions={"points": VoxelAutoencoder().size, "image": IMAGE},
     )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.02)
@@ -78,7 +80,11 @@ class Walk:
         pose = self.lap[place]
         count = NEW_POINTS if number < len(self.lap.t) else 0
         points = pose.t + 4 * torch.rand(count, 3, generator=self._random) - torch.tensor([2.0, 2.0, 3.0])
-        shown = torch.randn(self.pipeline.model.net.image_size, generator=self._random) if number % 2 == 0 else None
+        shown = (
+            torch.randn(self.pipeline.model.net.conditions["image"], generator=self._random)
+            if number % 2 == 0
+            else None
+        )
         return HeadSample(number / 60, pose, points, shown)
 
 

@@ -82,12 +82,20 @@ their frames."""
 TRAINED = {
     "AvatarPoser-style, watches": (
         "mocap_every_avatarposer",
-        ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror_average=false"),
+        (
+            "pipeline=mocap_every",
+            "pipeline.overlap.stride=1",
+            "pipeline.overlap.lookahead=0",
+            "pipeline.overlap.mirror_average=false",
+        ),
     ),
-    "AGRoL's MLP, watches (AGRoL*)": ("mocap_every_agrol", ("pipeline=mocap_every", "pipeline.mirror_average=false")),
+    "AGRoL's MLP, watches (AGRoL*)": (
+        "mocap_every_agrol",
+        ("pipeline=mocap_every", "pipeline.overlap.mirror_average=false"),
+    ),
     "AGRoL's MLP, hands tracked": (
         "mocap_every_agrol_hands",
-        ("pipeline=mocap_every", "pipeline.mirror_average=false"),
+        ("pipeline=mocap_every", "pipeline.overlap.mirror_average=false"),
     ),
     "as in the paper": ("mocap_every_paper", ("pipeline=paper/mocap_every",)),
     "neither": ("mocap_every_neither", ("pipeline=mocap_every",)),
@@ -362,7 +370,7 @@ def _ours(options: argparse.Namespace) -> list[Method]:
         "ours": ("pipeline=mocap_every",),
         "ours, floor fixed at the beginning": ("pipeline=mocap_every", level),
         UPRIGHT: ("pipeline=mocap_every", "+pipeline.carried=1"),
-        UNMIRRORED: ("pipeline=mocap_every", "pipeline.mirror_average=false"),
+        UNMIRRORED: ("pipeline=mocap_every", "pipeline.overlap.mirror_average=false"),
         "ours, not anchored to the head": ("pipeline=mocap_every", "pipeline.anchor=false"),
         "ours, three frames at a time": ("pipeline=mocap_every_online",),
         PREDICTED: ("pipeline=mocap_every", "pipeline.refinement=null"),

@@ -60,7 +60,7 @@ def test_localisation_and_map_are_found_apart(walked):
 
 def test_a_watch_and_a_head_tracker(walked):
     motion = walked.motion.motion
-    alone = ImuNoise(0.0, 8.0, 0.0, acc_noise=0.04, acc_bias=0.0, gyro_noise_deg_s=0.3, strap_deg=0.0)
+    alone = ImuNoise(0.0, 0.0, acc_noise=0.04, acc_bias=0.0, gyro_noise_deg_s=0.3, strap_deg=0.0)
     found = measured.watch_errors(motion, alone, np.random.default_rng(0))
     assert found["noise_ug_per_sqrt_hz"] == pytest.approx(1e6 * 0.04 / 9.81 / (motion.fps / 2) ** 0.5, rel=0.02)
     assert found["bias_mg"] < 0.1

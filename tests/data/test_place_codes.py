@@ -75,12 +75,12 @@ def test_made_once_per_encoder_and_recording(store, tmp_path):
     checkpoint(tmp_path / "b.ckpt", 1, size=24)
     checkpoint(tmp_path / "c.ckpt", 0, size=24, below_m=0.9)
     first = PlaceCodes(tmp_path / "a.ckpt")
-    first.prepare(store, ["r0", "r1"])
+    first.prepare([store], "train")
     files = [first.file_of(store.root, store.entries[name]) for name in ("r0", "r1")]
     assert len({file.parent for file in files}) == 1
     made = [file.stat().st_mtime_ns for file in files]
     again = PlaceCodes(tmp_path / "a.ckpt")
-    again.prepare(store, store.names())
+    again.prepare([store], "train")
     assert [again.file_of(store.root, store.entries[n]).stat().st_mtime_ns for n in ("r0", "r1")] == made
     assert len(list(files[0].parent.iterdir())) == 4
     others = [PlaceCodes(tmp_path / name).fingerprint for name in ("b.ckpt", "c.ckpt")]

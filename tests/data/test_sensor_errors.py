@@ -3,11 +3,12 @@
 import pytest
 import torch
 
-from wearcap.data.transforms import Draws, SensorErrors, Window
+from wearcap.data.transforms import Draws, SensorErrors, WatchErrors, Window
 from wearcap.data.windows import Source, Windows
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.sensors.imu import GRAVITY, acceleration, mean_filter
+from wearcap.sensors.simulated import SlamNoise
 from wearcap.systems.mocap_every.training_windows import WatchContent, WatchWindow
 from wearcap_testing import small_dataset
 
@@ -29,13 +30,25 @@ CHANGES = {
 """What the windows of MocapEvery differ in, by the error."""
 
 
+SLAM = {"tilt_deg": "lean_deg", "jitter_m": "jitter_m", "jitter_deg": "jitter_deg", "drift": "drift_share"}
+WATCH = {name: name for name in ("bias_m_s2", "play_deg", "delay_s", "silent")} | {"watch_tilt_deg": "tilt_deg"}
+"""Names of errors within their groups."""
+
+
+def errors_of(**errors: float) -> SensorErrors:
+    """Errors by their own names, whichever group they are in."""
+    slam, watches = ({names[one]: errors.pop(one) for one in [*errors] if one in names} for names in (SLAM, WATCH))
+    path = SlamNoise(**{"jitter_m": 0.0, "jitter_deg": 0.0} | slam) if any(slam.values()) else None
+    return SensorErrors(**errors, slam=path, watches=WatchErrors(**watches))
+
+
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> str:
     return str(small_dataset(tmp_path_factory.mktemp("data")).root)
 
 
 def watched(root: str, **errors: float) -> Windows:
-    transforms = {"errors": SensorErrors(**errors)} if errors else {}
+    transforms = {"errors": errors_of(**errors)} if errors else {}
     settings = {"window": 40, "stride": 10, "fps": FPS, "every": 2, "transforms": transforms}
     return Windows([Source(root)], "train", True, content=WatchContent(), **settings)
 
@@ -55,7 +68,7 @@ def walk() -> dict[str, torch.Tensor]:
 
 
 def wrong(values: dict[str, torch.Tensor], seed: int = 0, **errors: float) -> dict[str, torch.Tensor]:
-    return SensorErrors(**errors)(Window(values, fps=FPS), Draws(seed)).values
+    return errors_of(**errors)(Window(values, fps=FPS), Draws(seed)).values
 
 
 def angle_deg(R: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from wearcap.data.surroundings import Surroundings, embeddings_of, latest_before
+from wearcap.data.surroundings import Embeddings, PlaceCodes, embeddings_of, latest_before
 from wearcap.data.transforms import EarlyEnd, Mirror
 from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
@@ -21,12 +21,15 @@ from wearcap_testing import recording_of, swaying_motion
 SIZE = 5
 
 
-class CountedCodes:
+class CountedCodes(PlaceCodes):
     """Codes that count the frames, and count down from zero in the mirror."""
 
     size = 3
 
-    def prepare(self, store, names):
+    def __init__(self):
+        pass
+
+    def prepare(self, stores, split):
         """They are made where they are read."""
 
     def file_of(self, root, entry):
@@ -60,10 +63,8 @@ def store(tmp_path) -> RecordingStore:
 
 
 def dataset(store: RecordingStore, **transforms) -> Windows:
-    surroundings = object.__new__(Surroundings)  # codes without a network
-    object.__setattr__(surroundings, "places", CountedCodes())
-    object.__setattr__(surroundings, "images", "toy")
-    settings = {"content": HeadContent(surroundings), "window": 120, "stride": 60, "fps": 60.0}
+    conditions = {"points": CountedCodes(), "image": Embeddings("toy")}
+    settings = {"content": HeadContent(conditions), "window": 120, "stride": 60, "fps": 60.0}
     return Windows([Source(str(store.root))], "train", True, transforms=transforms, **settings)
 
 
@@ -77,28 +78,26 @@ def first_of(windows: Windows, name: str, start: int) -> int:
 
 def test_codes_and_pictures_are_those_of_the_windows_frames(store):
     windows = dataset(store)
-    assert windows.content.image_size == SIZE
+    assert windows.content.conditions["image"].size == SIZE
     window = windows[first_of(windows, "a", 60)]
     frames = torch.arange(60, 180)
-    assert torch.equal(window.points[:, 0], frames.float())
-    assert torch.equal(window.image[:, 0], (frames // 2).float()), "each picture serves two frames"
-    assert window.points_valid.all()
-    assert window.image_valid.all()
+    assert torch.equal(window.others[:, 0], frames.float())
+    assert torch.equal(window.others[:, -1], (frames // 2).float()), "each picture serves two frames"
+    assert window.given.all()
 
 
 def test_a_recording_without_pictures_is_reported(store):
     windows = dataset(store)
     window = windows[first_of(windows, "b", 0)]
-    assert window.image.shape == (120, SIZE)
-    assert not window.image_valid.any()
-    assert window.points_valid.all()
+    assert window.others.shape == (120, 3 + SIZE)
+    assert window.given.all(0).tolist() == [True, False]
 
 
 def test_the_mirror_reads_what_the_mirror_shows(store):
     windows = dataset(store, mirror=Mirror())
     index = first_of(windows, "a", 60)
     seen = [windows[(index, seed)] for seed in range(12)]
-    signs = {(w.points[:, 0].sign().sum().item(), w.image[:, 0].sign().sum().item()) for w in seen}
+    signs = {(w.others[:, 0].sign().sum().item(), w.others[:, -1].sign().sum().item()) for w in seen}
     assert signs == {(120.0, 120.0), (-120.0, -120.0)}
 
 
@@ -111,11 +110,11 @@ def test_beginnings_are_cut_short(store):
     assert len(lengths) > 10
     window = cut[(0, 3)]
     last = int(window.valid.sum()) - 1
-    assert torch.equal(window.points[last:], window.points[last : last + 1].expand(120 - last, -1))
+    assert torch.equal(window.others[last:], window.others[last : last + 1].expand(120 - last, -1))
 
 
 def test_data_without_the_encoders_embeddings_is_refused(store):
-    content = HeadContent(Surroundings(None, "clip"))
+    content = HeadContent({"image": Embeddings("clip")})
     with pytest.raises(WearcapError, match="no recording has embeddings of 'clip'.*prepare embeddings"):
         Windows([Source(str(store.root))], "train", content=content, window=120, stride=60, fps=60.0)
 

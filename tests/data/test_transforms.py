@@ -8,6 +8,7 @@ from contact_motion import CLASSES, bending_dataset
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
 from wearcap.data.motion_features import MotionFeatures, MovementContent
+from wearcap.data.surroundings import PlaceCodes
 from wearcap.data.transforms import (
     Draws,
     DropFrames,
@@ -143,7 +144,7 @@ def test_a_larger_wearer_has_longer_limbs_and_a_lower_floor(roots):
 
 def test_codes_of_points_cannot_be_scaled(roots):
     data = windows(roots, "hmd2", scale=Scale())
-    data.content.surroundings = type("Surroundings", (), {"places": object()})()
+    data.content.conditions = {"points": PlaceCodes("none")}
     with pytest.raises(WearcapError, match="codes of points cannot be scaled"):
         data[0]
 

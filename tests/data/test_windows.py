@@ -112,7 +112,7 @@ def test_sources_are_drawn_by_their_weights(store, tmp_path):
 
 def test_statistics_normalise_what_the_loader_gives(store):
     windows, features = dataset(store), HeadFeatures()
-    mean, scale = feature_statistics(windows, features)["motion"]
+    mean, scale = feature_statistics(windows, features, {})["motion"]
     batch = collate([windows[item] for item in FixedSampler(len(windows)).items])
     encoded = (
         features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)[batch.valid] - mean

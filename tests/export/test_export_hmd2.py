@@ -17,6 +17,7 @@ from wearcap.export import files
 from wearcap.export.files import RUN_BY_FORMAT, load_exported, open_exported
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
+from wearcap.models.layers import TransformerSize
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import CameraStream, HeadStream, PointCloud, Recording
 from wearcap.recording.store import RecordingFile, save_recording
@@ -52,14 +53,10 @@ def pipeline() -> HMD2:
         features.motion_size,
         features.condition_size,
         WINDOW,
-        width=32,
-        layers=1,
-        heads=2,
-        feedforward=64,
+        TransformerSize(32, 1, 2, 64, 0.1),
         frames_per_token=2,
         blend=5,
-        points_size=places.size,
-        image_size=IMAGE,
+        conditions={"points": places.size, "image": IMAGE},
         self_conditioning=True,
     )
     for parameter in net.parameters():
@@ -132,7 +129,7 @@ def test_pipeline_reports_small_error(exports, format):
 def test_runner_equals_the_eager_pipeline(pipeline, recording, exports, format):
     eager = pipeline(recording, seed=5)
     motion = load_exported(exports[format][0])(recording, seed=5)
-    assert pipeline.sense(recording, head_path(recording, xsens23(), 60.0)).points_valid.any()
+    assert pipeline.sense(recording, head_path(recording, xsens23(), 60.0)).given[..., 0].any()
     torch.testing.assert_close(motion.R_parent_joint, eager.R_parent_joint, atol=1e-4, rtol=0)
     torch.testing.assert_close(motion.t_world_root, eager.t_world_root, atol=1e-4, rtol=0)
     other = load_exported(exports[format][0])(recording, seed=6)

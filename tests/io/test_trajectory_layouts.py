@@ -12,7 +12,7 @@ from short_walk import CAMERA_IN_HEAD, lines, numbers, quat_xyzw
 from wearcap.errors import WearcapError
 from wearcap.io.devices.axes import device_axes
 from wearcap.io.formats.trajectory import read_trajectory, read_trajectory_file, trajectory_file, trajectory_format
-from wearcap.prepare.logs import TrajectorySettings, head_of, origin_of, read_cloud
+from wearcap.prepare.logs import Evidence, TrajectorySettings, head_of, origin_of, read_cloud
 
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Turns a world with z up into one with y up."""
@@ -298,7 +298,7 @@ def test_the_origin_brings_places_back_to_the_map(tmp_path):
     offset = np.array([458074.6, 162.9, -5429380.17])  # y up
     path = short_walk.tum(tmp_path / "t.txt", time, Y_UP @ R @ CAMERA_IN_HEAD, t @ Y_UP.T + offset)
     read = read_trajectory_file(path)
-    settings = TrajectorySettings(camera_height_m=1.62)
+    settings = TrajectorySettings(evidence=Evidence(camera_height_m=1.62))
     head, alignment, _ = head_of(read, settings, "t")
     origin = origin_of(read, alignment)
     assert origin is not None

@@ -44,6 +44,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
 from wearcap.io.formats.motion_npz import read_motion
+from wearcap.models.layers import TransformerSize
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import joined
 from wearcap.sensors.samples import HeadSample, WatchSample
@@ -79,7 +80,9 @@ class Kept(Sink):
 def small_hmd2(**changes):
     torch.manual_seed(0)
     features = HeadFeatures(contacts=True, body=True)
-    net = MotionDenoiser(features.motion_size, features.condition_size, 60, 32, 1, 4, 64, 0.0, 4, blend=5)
+    net = MotionDenoiser(
+        features.motion_size, features.condition_size, 60, TransformerSize(32, 1, 4, 64, 0.0), 4, blend=5
+    )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
     return hmd2_of(net, features, steps=3, **{"stride": 10, "lookahead": 14, "fade": 6, "live": True} | changes)
@@ -128,7 +131,7 @@ def test_at_its_own_pace_poses_leave_after_the_systems_latency():
     assert time.monotonic() - begin_s > sensed.head.timestamps[-1].item()
     latency = report["wearers"]["wearer"]["latency_ms"]
     # The quickest packet's delay counts as none; frames of a stride but the first wait for less than the system's.
-    assert latency["of_the_system"] - 1000 * system.stride / system.fps < latency["median"]
+    assert latency["of_the_system"] - 1000 * system.overlap.stride / system.fps < latency["median"]
 
 
 class Scripted(Source):

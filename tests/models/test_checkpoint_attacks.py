@@ -208,9 +208,9 @@ def test_giant_sizes_take_no_memory(tmp_path):
 
 def test_long_trainings_and_any_seed_are_no_giants(tmp_path):
     config, state = read_checkpoint("hmd2")
-    model = config["model"] | {"seed": 2**62}
-    model["scheduler"] |= {"total": 10**9}
-    load_trained(checkpoint(tmp_path / "x.safetensors", model, state))
+    config["model"]["optimization"]["seed"] = 2**62
+    config["model"]["optimization"]["scheduler"] |= {"total": 10**9}
+    load_trained(checkpoint(tmp_path / "x.safetensors", config["model"], state))
 
 
 def test_weights_that_repeat_themselves_without_memory_are_refused(tmp_path):

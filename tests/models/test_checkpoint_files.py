@@ -1,5 +1,6 @@
 """Shared checkpoints: written, stored in half the width, found by name, and refused when they are not what they should be."""
 
+import copy
 import json
 import re
 import shutil
@@ -7,13 +8,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
 
 from wearcap.errors import WearcapError
 from wearcap.models import checkpoint as module
-from wearcap.models.build import build
-from wearcap.models.checkpoint import load_trained, read_checkpoint, share_checkpoint
+from wearcap.models.build import brought_up_to_date, build
+from wearcap.models.checkpoint import load_trained, read_checkpoint, share_checkpoint, shared_checkpoints
 from wearcap.models.weights import check_weights
 
 pytestmark = pytest.mark.usefixtures("trusted")
@@ -22,10 +24,14 @@ MODEL = {
     "_target_": "wearcap.systems.ireplica.training.ContactDetection",
     "net": {"_target_": "wearcap.systems.ireplica.contact_sequence.ContactSequence", "_partial_": True, "width": 40},
     "skeleton": {"_target_": "wearcap.body.skeleton.xsens23"},
-    "optimizer": {"_target_": "torch.optim.AdamW", "lr": 1e-3},
-    "scheduler": {"_target_": "wearcap.training.schedules.warmup_cosine", "_partial_": True},
+    "optimization": {
+        "_target_": "wearcap.training.base.Optimization",
+        "optimizer": {"_target_": "torch.optim.AdamW", "lr": 1e-3},
+        "scheduler": {"_target_": "wearcap.training.schedules.warmup_cosine", "_partial_": True},
+    },
     "parts": [{"_target_": "wearcap.diffusion.schedule.CosineSchedule"}],
 }
+HMD2 = "wearcap.systems.hmd2.training"
 CONF = Path(__file__).parents[2] / "conf"
 SOURCES = {"cmu": {"root": "datasets/cmu", "weight": 1.0}, "simulated": None}
 
@@ -260,3 +266,38 @@ def test_a_flipped_bit_anywhere_in_weights_or_config_is_refused(kind, tmp_path):
             continue
         # What no checksum covers is padding, names of the archive's parts that nothing reads, and the like.
         assert all(torch.equal(read[name], value) for name, value in state.items())
+
+
+def former_model(name: str) -> dict:
+    """The model's config as a shared checkpoint's file has it."""
+    with safe_open(str(shared_checkpoints()[name]), "pt") as file:
+        return json.loads(file.metadata()["wearcap_checkpoint"])["model"]
+
+
+def test_former_settings_are_grouped():
+    config = former_model("hmd2")
+    former = copy.deepcopy(config)
+    brought_up_to_date(config)
+    assert config["levels"] == {"_target_": f"{HMD2}.Levels", "tilt": former["level_tilt"], "pure": former["pure"]}
+    loss = {"weights": former["loss_weights"], "tail": former["tail"], "contact_share": former["contact_share"]}
+    assert config["loss"] == {"_target_": f"{HMD2}.Loss"} | loss
+    image = {"encoder": former["image_encoder"], "size": former["image_size"]}
+    both = {"points": {"encoder": former["place_encoder"]}, "image": image}
+    assert config["conditions"] == {name: one | {"drop": former["drop"]} for name, one in both.items()}
+    assert [*config["conditions"]] == ["points", "image"], "the order of the network's inputs"
+    sizes = {name: former["net"][name] for name in ("width", "layers", "heads", "feedforward", "dropout")}
+    assert config["net"]["transformer"] == {"_target_": "wearcap.models.layers.TransformerSize"} | sizes
+    left = {"features", "schedule", "skeleton", "fps", "compile", "_target_"}
+    assert set(config) == {*left, "net", "levels", "loss", "conditions", "optimization"}
+    assert {name: config[name] for name in left} == {name: former[name] for name in left}
+
+
+@pytest.mark.parametrize("name", shared_checkpoints())
+def test_todays_settings_stay_as_they_are(name):
+    config = former_model(name)
+    former = {key: config[key] for key in ("optimizer", "scheduler", "seed") if key in config}
+    brought_up_to_date(config)
+    once = copy.deepcopy(config)
+    assert config["optimization"] == {"_target_": "wearcap.training.base.Optimization"} | former
+    brought_up_to_date(config)
+    assert config == once

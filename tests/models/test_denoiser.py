@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.models.layers import Normalizer
+from wearcap.models.layers import Normalizer, TransformerSize
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
 
 
 def small(**changes) -> MotionDenoiser:
-    settings = {"motion_size": 12, "condition_size": 5, "window": 16, "width": 32, "layers": 2, "heads": 4}
-    net = MotionDenoiser(**settings | {"feedforward": 64, "dropout": 0.0} | changes)
+    settings = {"motion_size": 12, "condition_size": 5, "window": 16}
+    net = MotionDenoiser(**settings, transformer=TransformerSize(32, 2, 4, 64, 0.0), **changes)
     for parameter in net.parameters():  # zero-initialised gates would hide what the blocks do
         torch.nn.init.normal_(parameter, std=0.1)
     return net.eval()
@@ -20,7 +20,8 @@ def conditions_of(head: torch.Tensor, points: int = 0, image: int = 0) -> Condit
     """Conditions of a head alone, or with random points and pictures everywhere."""
     batch, time, _ = head.shape
     there = torch.ones(batch, time, dtype=torch.bool)
-    return Conditions(head, torch.randn(batch, time, points), there, torch.randn(batch, time, image), there)
+    given = there[..., None].expand(-1, -1, (points > 0) + (image > 0))
+    return Conditions(head, torch.randn(batch, time, points + image), given)
 
 
 def denoise(net: MotionDenoiser, x_t, level, condition, valid) -> torch.Tensor:
@@ -108,25 +109,27 @@ def test_blending_is_smoother_and_never_mixes_in_padding():
 
 
 def test_a_missing_modality_is_null_whatever_its_numbers_are():
-    net = small(points_size=3, image_size=4)
+    net = small(conditions={"points": 3, "image": 4})
     _, _, head, valid = inputs()
     whole = conditions_of(head, 3, 4)
-    blind = whole._replace(points_valid=valid & False, image_valid=valid & False)
-    other = blind._replace(points=blind.points + 5, image=blind.image * torch.inf)
+    blind = whole._replace(given=whole.given & False)
+    other = blind._replace(others=torch.cat([blind.others[..., :3] + 5, blind.others[..., 3:] * torch.inf], -1))
     assert torch.equal(net.encode(blind, valid), net.encode(other, valid))
-    for part in ("points", "image"):
-        changed = whole._replace(**{part: getattr(whole, part) + 1})
+    for number, part in enumerate((slice(0, 3), slice(3, 7))):
+        more, given = torch.zeros(7), torch.ones(2, dtype=torch.bool)
+        more[part], given[number] = 1, False
+        changed = whole._replace(others=whole.others + more)
         assert not torch.allclose(net.encode(changed, valid), net.encode(whole, valid), atol=1e-3)
-        gone = whole._replace(**{f"{part}_valid": valid & False})
+        gone = whole._replace(given=whole.given & given)
         assert not torch.allclose(net.encode(gone, valid), net.encode(whole, valid), atol=1e-3)
 
 
 def test_a_scene_at_the_null_vector_is_not_taken_for_a_missing_one():
-    net = small(points_size=3, frames_per_token=4)
+    net = small(conditions={"points": 3}, frames_per_token=4)
     _, _, head, valid = inputs()
     points = net.condition_encoder.points
-    at_null = conditions_of(head, 3)._replace(points=points.normalizer.inverse(points.null).expand(2, 16, 3))
-    gone = at_null._replace(points_valid=valid & False)
+    at_null = conditions_of(head, 3)._replace(others=points.normalizer.inverse(points.null).expand(2, 16, 3))
+    gone = at_null._replace(given=at_null.given & False)
     assert not torch.allclose(net.encode(at_null, valid), net.encode(gone, valid), atol=1e-3)
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
+from wearcap.models.layers import TransformerSize
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser, StepRunner
 
 LEVELS = torch.tensor([1.0, 0.6, 0.2])
@@ -17,7 +18,9 @@ LEVELS = torch.tensor([1.0, 0.6, 0.2])
 
 def network(device: str = "cpu", **changes) -> MotionDenoiser:
     torch.manual_seed(0)
-    net = MotionDenoiser(12, 5, 16, 32, 2, 4, 64, frames_per_token=4, blend=5, points_size=6, **changes)
+    net = MotionDenoiser(
+        12, 5, 16, TransformerSize(32, 2, 4, 64, 0.1), frames_per_token=4, blend=5, conditions={"points": 6}, **changes
+    )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.2)
     return net.eval().to(device)
@@ -27,9 +30,7 @@ def inputs_of(net: MotionDenoiser, batch: int, device: str = "cpu"):
     """x_t, what the conditions say, `valid` with a window that is still growing, the last x̂0."""
     torch.manual_seed(1)
     valid = torch.arange(16).expand(batch, -1) < torch.tensor([[9]] + [[16]] * (batch - 1))
-    conditions = Conditions(
-        torch.randn(batch, 16, 5), torch.randn(batch, 16, 6), valid, torch.zeros(batch, 16, 0), valid
-    )
+    conditions = Conditions(torch.randn(batch, 16, 5), torch.randn(batch, 16, 6), valid[..., None])
     with torch.inference_mode():
         encoded = net.encode(Conditions(*(part.to(device) for part in conditions)), valid.to(device))
     x_t, last = torch.randn(2, batch, 16, 12)

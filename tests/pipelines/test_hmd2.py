@@ -9,6 +9,7 @@ from small_hmd2 import hmd2_of
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import evaluate
 from wearcap.geometry.camera import Camera
+from wearcap.models.layers import TransformerSize
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import CameraStream, PointCloud, Recording
 from wearcap.systems.hmd2.features import HeadFeatures
@@ -28,14 +29,9 @@ def pipeline(frame: str = "heading", **changes) -> HMD2:
         features.motion_size,
         features.condition_size,
         60,
-        32,
-        1,
+        TransformerSize(32, 1, 4, 64, 0.0),
         4,
-        64,
-        0.0,
-        4,
-        points_size=places.size,
-        image_size=IMAGE_SIZE,
+        conditions={"points": places.size, "image": IMAGE_SIZE},
     )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)

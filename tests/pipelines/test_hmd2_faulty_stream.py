@@ -9,9 +9,9 @@ from test_hmd2_stream import IMAGE, WINDOW, moments, stream, surrounded, wearer
 from bad_packets import TIMES, VECTORS, Mutator, bad_poses, unchecked
 from small_hmd2 import hmd2_of
 from wearcap.errors import WearcapError
+from wearcap.models.layers import TransformerSize
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import Motion
-from wearcap.systems.hmd2 import sensing
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.places import Memory
@@ -30,15 +30,10 @@ def hmd2():
         features.motion_size,
         features.condition_size,
         WINDOW,
-        32,
-        1,
-        4,
-        64,
-        0.0,
+        TransformerSize(32, 1, 4, 64, 0.0),
         4,
         blend=5,
-        points_size=places.size,
-        image_size=IMAGE,
+        conditions={"points": places.size, "image": IMAGE},
     )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
@@ -157,13 +152,13 @@ def _joined(parts: list[Motion], count: int) -> dict[str, torch.Tensor]:
 
 
 def test_what_waits_for_a_lost_head_is_bounded(hmd2, recording, monkeypatch):
-    monkeypatch.setattr(sensing, "MAX_WAITING", 30)
+    monkeypatch.setattr("wearcap.systems.hmd2.conditions.MAX_WAITING", 30)
     session = HMD2Session(hmd2, [wearer(recording)], [0], Memory(max_points=1000))
     for k in range(200):
         pushed(session, [[HeadSample(k / 60, None, torch.rand(100, 3), torch.zeros(IMAGE), 0.0)]])
     known = session.streams[0].sensing
     places = known.places
-    assert len(known.images) == len(known.floors) == 30
+    assert len(known.sensed["image"].values) == len(known.floors) == 30
     assert len(places.map) == sum(len(points) for points, _ in places._new) <= 4000
 
 
@@ -190,4 +185,4 @@ def test_whatever_comes_it_goes_on(hmd2, recording, seed):
     well = run(session, conditions, 4.0)
     assert max(motion.timestamps[-1].item() for motion in well) > 5.1
     state = session.streams[0]
-    assert len(state.sensing.images) + len(state.sensing.floors) + len(state._track._poses) < 300
+    assert len(state.sensing.sensed["image"].values) + len(state.sensing.floors) + len(state._track._poses) < 300

@@ -12,6 +12,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
+from wearcap.models.layers import TransformerSize
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import CameraStream, Motion, PointCloud, Recording
 from wearcap.runtime.wearer import Wearer
@@ -44,15 +45,10 @@ def pipeline(places):
             features.motion_size,
             features.condition_size,
             WINDOW,
-            32,
-            1,
-            4,
-            64,
-            0.0,
+            TransformerSize(32, 1, 4, 64, 0.0),
             4,
             blend=5,
-            points_size=places.size if points else 0,
-            image_size=IMAGE if points else 0,
+            conditions={"points": places.size, "image": IMAGE} if points else {},
         )
         for parameter in net.parameters():
             torch.nn.init.normal_(parameter, std=0.05)

@@ -21,6 +21,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate, resample
 from wearcap.io.devices.aria_mps import read_closed_loop, read_mps
 from wearcap.metrics.scores import cue_errors_cm
+from wearcap.models.layers import TransformerSize
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor
@@ -181,7 +182,12 @@ def hmd2() -> HMD2:
     torch.manual_seed(0)
     features, places = HeadFeatures(), VoxelAutoencoder()
     net = MotionDenoiser(
-        features.motion_size, features.condition_size, 60, 32, 1, 4, 64, 0.0, 4, points_size=places.size
+        features.motion_size,
+        features.condition_size,
+        60,
+        TransformerSize(32, 1, 4, 64, 0.0),
+        4,
+        conditions={"points": places.size},
     )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)

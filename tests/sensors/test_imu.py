@@ -14,7 +14,7 @@ from wearcap.sensors.imu import GRAVITY, ImuNoise, acceleration, angular_rate, m
 from wearcap_testing import swaying_motion
 
 FPS = 60.0
-NONE = ImuNoise(0.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NONE = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def carousel(frames: int = 601, rate: float = 0.8, radius: float = 1.5) -> Motion:

@@ -23,7 +23,12 @@ from wearcap.training.loggers import read_metrics
 from wearcap.training.run import differing_keys, resume_path, run_to_continue
 from wearcap_testing import small_dataset
 
-SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
+SMALL = [
+    "model.net.transformer.width=32",
+    "model.net.transformer.layers=1",
+    "model.net.transformer.heads=4",
+    "model.net.transformer.feedforward=32",
+]
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +205,14 @@ def test_weights_of_another_model_are_named_in_one_line(data, trained, tmp_path,
     torch.save(saved, tmp_path / "odd.ckpt")
     with pytest.raises(WearcapError) as caught:
         train.main(
-            arguments(data, tmp_path, f"init={tmp_path}/odd.ckpt", run, "model.net.layers=2", "+features.contacts=true")
+            arguments(
+                data,
+                tmp_path,
+                f"init={tmp_path}/odd.ckpt",
+                run,
+                "model.net.transformer.layers=2",
+                "+features.contacts=true",
+            )
         )
     text = str(caught.value)
     assert text.startswith(f"{tmp_path}/odd.ckpt: its weights are not this model's; ")

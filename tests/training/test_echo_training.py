@@ -22,6 +22,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
+from wearcap.models.layers import TransformerSize
 from wearcap.recording import RecordingStore
 from wearcap.systems.echo.features import HANDS, OBJECT_SIZE, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
@@ -29,6 +30,7 @@ from wearcap.systems.echo.scores import score_echo
 from wearcap.systems.echo.training import SLOPE, STANDING, EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
+from wearcap.training.base import Optimization
 from wearcap_testing import experiments, small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
@@ -70,8 +72,12 @@ def batch(features, *roots: str, count: int = 8) -> EchoWindow:
 
 def learner(net=None, frame: str = "own", features: EchoFeatures | None = None, **changes) -> EchoDiffusion:
     features = features or small_features(frame)
-    make = net or partial(EchoDenoiser, window=WINDOW, width=32, layers=1, heads=2, feedforward=32, dropout=0.0)
-    given = {"loss_weights": WEIGHTS, "levels": LevelMix(0.25, 0.6, 0.15, ramp=(4, 16)), "optimizer": torch.optim.AdamW}
+    make = net or partial(EchoDenoiser, window=WINDOW, transformer=TransformerSize(32, 1, 2, 32, 0.0))
+    given = {
+        "loss_weights": WEIGHTS,
+        "levels": LevelMix(0.25, 0.6, 0.15, ramp=(4, 16)),
+        "optimization": Optimization(torch.optim.AdamW),
+    }
     return EchoDiffusion(make, features, CosineSchedule(), xsens23(), **given | changes)
 
 
@@ -298,10 +304,10 @@ def arguments(experiment: str, data: str, people: str, run: Path, *more: str) ->
         "data.dataset.content.encoder=null",
         "model.encoder=null",
         "features.shape_size=0",
-        "model.net.width=32",
-        "model.net.layers=1",
-        "model.net.heads=4",
-        "model.net.feedforward=32",
+        "model.net.transformer.width=32",
+        "model.net.transformer.layers=1",
+        "model.net.transformer.heads=4",
+        "model.net.transformer.feedforward=32",
         "trainer.accelerator=cpu",
         "trainer.precision=32-true",
         "trainer.log_every_n_steps=1",
@@ -358,7 +364,7 @@ def test_stopped_and_resumed_equals_straight_through(data, people, tmp_path):
     """Batches, noise, levels and dropout are functions of seed and step."""
     more = (
         "data.loading.steps_per_epoch=2",
-        "model.net.dropout=0.3",
+        "model.net.transformer.dropout=0.3",
         "optimizer.scheduler.total=6",
         "optimizer.scheduler.warmup=1",
     )

@@ -10,12 +10,16 @@ import pytest
 import torch
 
 from wearcap.cli import capture, evaluate, train
-from wearcap.data.surroundings import PlaceCodes
+from wearcap.data.surroundings import ConditionWindows, PlaceCodes
 from wearcap.errors import WearcapError
+from wearcap.export.files import load_exported, write_exports
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
+from wearcap.systems.hmd2.conditions import CONDITIONS, Condition, Sensed
+from wearcap.systems.hmd2.pipeline import HMD2, Sampling
 from wearcap_testing import experiments, recording_of, swaying_motion
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
@@ -40,7 +44,9 @@ def seeing(seed: int) -> Recording:
         embedding_mirrored=-shown,
         embedding_name="egoview-01234567",
     )
-    return dataclasses.replace(recording, points=PointCloud(points), camera=camera)
+    wrists = {joint: recording.motion.joint(joint) for joint in ("left_wrist", "right_wrist")}
+    tracked = {joint: Trajectory(recording.motion.timestamps, T.R, T.t) for joint, T in wrists.items()}
+    return dataclasses.replace(recording, points=PointCloud(points), camera=camera, tracked=tracked)
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +100,11 @@ def trained(experiment: str, data: Path, places: Path | None, run: Path, *more: 
             f"paths.outputs={run.parent}",
             "data.dataset.window=60",
             "trainer.precision=32-true",
-            *([] if places is None else [f"surroundings.places.checkpoint={places}"]),
-            "model.net.width=32",
-            "model.net.layers=1",
-            "model.net.heads=4",
-            "model.net.feedforward=32",
+            *([] if places is None else [f"surroundings.windows.points.checkpoint={places}"]),
+            "model.net.transformer.width=32",
+            "model.net.transformer.layers=1",
+            "model.net.transformer.heads=4",
+            "model.net.transformer.feedforward=32",
             *QUIET,
             *more,
         ]
@@ -191,8 +197,8 @@ def test_validation_logs_captures_before_and_after_their_refinement(checkpoint):
 
 
 def test_windows_and_model_must_see_the_same(data, places, tmp_path):
-    with pytest.raises(WearcapError, match="points of 0 and images of 64 features.*Expected 128 and 64"):
-        trained("hmd2", data, places, tmp_path / "run", "data.dataset.content.surroundings.places=null")
+    with pytest.raises(WearcapError, match="features {'image': 64}.*Expected {'points': 128, 'image': 64}"):
+        trained("hmd2", data, places, tmp_path / "run", "~data.dataset.content.conditions.points")
 
 
 @pytest.mark.parametrize("surroundings", ["points", "head"])
@@ -200,6 +206,49 @@ def test_rows_of_the_ablation_train_by_themselves(surroundings, data, places, tm
     more = ["callbacks.capture=null", f"surroundings={surroundings}"]
     run = trained("hmd2", data, places if surroundings == "points" else None, tmp_path / "run", *more)
     system = load_trained(run)[0]
-    sizes = (system.net.points_size > 0, system.net.image_size > 0)
-    assert sizes == (surroundings == "points", False)
-    assert system.image_encoder is None
+    assert [*system.net.conditions] == {"points": ["points"], "head": []}[surroundings]
+
+
+def higher_wrist(recording: Recording) -> torch.Tensor:
+    """Height (m) of the higher wrist, as tracked, "time 1"."""
+    return torch.stack([track.t_world_body[:, 2:] for track in recording.tracked.values()]).amax(0)
+
+
+class WristHeight(Condition):
+    """A condition that HMD² does not have: the height of the higher wrist."""
+
+    use, field = "wrist", "wrist_height"
+
+    def take_all(self, sensed: Sensed, recording: Recording) -> None:
+        sensed.values.times = recording.tracked["left_wrist"].timestamps
+        sensed.values.values = higher_wrist(recording)
+
+
+class WristHeights(ConditionWindows):
+    size = 1
+
+    def read(self, store, name, start, stop, mirrored):
+        height = higher_wrist(store.load(name))[start:stop]
+        return height, torch.ones(len(height), dtype=torch.bool)
+
+
+def test_a_new_condition_takes_a_class_a_reader_and_a_config(data, tmp_path, monkeypatch):
+    """The places of docs/hmd2.md: it is trained with, captured with and exported."""
+    monkeypatch.setitem(CONDITIONS, "wrist", WristHeight)
+    windows = f"+surroundings.windows.wrist={{_target_:{__name__}.WristHeights}}"
+    given = ["surroundings=head", windows, "+surroundings.network.wrist={size:1,drop:0.5}", "callbacks.capture=null"]
+    checkpoint = trained("hmd2", data, None, tmp_path / "run", *given)
+    module, _ = load_trained(checkpoint)
+    store = RecordingStore.open(data)
+    heights = torch.cat([higher_wrist(store.load(name)) for name in store.names("train")])
+    normalizer = module.net.condition_encoder.wrist.normalizer
+    assert normalizer.mean.item() == pytest.approx(heights.mean().item(), abs=heights.std().item())
+    pipeline = HMD2(module.pipeline_parts()["model"], Sampling(steps=2))
+    torch.nn.init.normal_(module.net.head.weight, std=0.1)
+    recording = store.load("r3")
+    motion, without = (system(recording) for system in (pipeline, dataclasses.replace(pipeline, use=[])))
+    assert not torch.equal(motion.R_parent_joint, without.R_parent_joint), "it is listened to"
+    write_exports(pipeline.exports(), tmp_path / "model.onnx", "onnx")
+    assert json.loads((tmp_path / "model.json").read_text())["conditions"]["wrist"]["size"] == 1
+    exported = load_exported(tmp_path / "model.onnx")(recording)
+    assert torch.allclose(exported.R_parent_joint, motion.R_parent_joint, atol=1e-3)

@@ -26,6 +26,7 @@ from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.training import ContactDetection, IReplicaValidation, fit
 from wearcap.systems.ireplica.training_windows import ContactContent
+from wearcap.training.base import Optimization
 
 
 class TrueMotion(StagedSystem):
@@ -75,7 +76,9 @@ def equipped(root: Path, recording: Recording) -> Recording:
 def validated(root: Path, registration: TrueMotion) -> dict:
     features = HandViews()
     torch.manual_seed(0)
-    module = ContactDetection(partial(ContactSequence, width=8), features, list(CLASSES), 60.0, torch.optim.Adam)
+    module = ContactDetection(
+        partial(ContactSequence, width=8), features, list(CLASSES), 60.0, Optimization(torch.optim.Adam)
+    )
     content = ContactContent(features, list(CLASSES), 60.0)
     dataset = partial(Windows, content=content, window=120, stride=120, fps=60.0)
     data = WindowsModule(dataset, Loading(4), {"s": {"root": str(root), "weight": 1.0}})

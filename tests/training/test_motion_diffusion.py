@@ -1,5 +1,7 @@
 """The training module: which noise levels the network sees, and what its losses compare."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import nn
@@ -8,10 +10,12 @@ from wearcap.body.skeleton import xsens23
 from wearcap.data.windows import Source, Windows, collate
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
+from wearcap.models.layers import TransformerSize
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
-from wearcap.systems.hmd2.training import MotionDiffusion
+from wearcap.systems.hmd2.training import Levels, Loss, MotionDiffusion
 from wearcap.systems.hmd2.training_windows import HeadContent
+from wearcap.training.base import Optimization
 from wearcap_testing import small_dataset
 
 
@@ -34,13 +38,13 @@ class Spy(nn.Module):
 def system(batch, level_tilt: float, pure: float = 0.0) -> MotionDiffusion:
     features = HeadFeatures()
 
-    def net(motion_size, condition_size, points_size, image_size):
-        plain = MotionDenoiser(motion_size, condition_size, 60, 32, 1, 4, 32, 0.0, 4)
+    def net(motion_size, condition_size, conditions):
+        plain = MotionDenoiser(motion_size, condition_size, 60, TransformerSize(32, 1, 4, 32, 0.0), 4)
         return Spy(plain, features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact))
 
-    weights = {"motion": 1.0, "joints": 1.0, "velocity": 1.0}
-    levels = {"level_tilt": level_tilt, "pure": pure}
-    return MotionDiffusion(net, features, CosineSchedule(), xsens23(), 60.0, weights, torch.optim.AdamW, **levels)
+    loss, levels = Loss({"motion": 1.0, "joints": 1.0, "velocity": 1.0}, 0.0, None), Levels(level_tilt, pure)
+    how = levels, loss, Optimization(torch.optim.AdamW)
+    return MotionDiffusion(net, features, CosineSchedule(), xsens23(), 60.0, *how)
 
 
 def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_path):
@@ -85,7 +89,7 @@ def test_the_last_frames_that_exist_weigh_more_by_the_tail(tmp_path):
     truth = module.net.answer
 
     def cost(frame: int, tail: float) -> float:
-        module.tail = tail
+        module.loss = replace(module.loss, tail=tail)
         module.net.answer = truth + 0.1 * (torch.arange(60) == frame)[None, :, None]
         return module.terms(batch)["motion"].item()
 

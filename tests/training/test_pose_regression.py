@@ -21,6 +21,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.training_windows import HeadContent
+from wearcap.training.base import Optimization
 from wearcap_testing import small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
@@ -63,7 +64,7 @@ def system(points: tuple[str, ...] = HANDS, net=PoseRegressor) -> PoseRegression
         xsens23(),
         60.0,
         weights,
-        torch.optim.AdamW,
+        Optimization(torch.optim.AdamW),
         pairs=2,
     )
 

@@ -19,7 +19,12 @@ from wearcap_testing import experiments, small_dataset
 
 EXPERIMENTS = experiments("motion_diffusion")
 KINDS = ("motion_", "contact_", "egoview", "voxel_autoencoder", "hmd2", "mocap_every", "object_encoder", "echo")
-SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
+SMALL = [
+    "model.net.transformer.width=32",
+    "model.net.transformer.layers=1",
+    "model.net.transformer.heads=4",
+    "model.net.transformer.feedforward=32",
+]
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +197,7 @@ def test_overfits_one_batch(data, tmp_path):
     more = [
         "debug=overfit",
         "trainer.max_steps=60",
-        "model.net.dropout=0",
+        "model.net.transformer.dropout=0",
         "data.loading.batch_size=2",
         "data.loading.steps_per_epoch=1",
         "optimizer.optimizer.lr=0.01",

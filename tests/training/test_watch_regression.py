@@ -19,6 +19,7 @@ from wearcap.errors import WearcapError
 from wearcap.io.formats.amass import read_amass
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
+from wearcap.models.layers import TransformerSize
 from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.manifold_training import ManifoldTraining
@@ -26,12 +27,17 @@ from wearcap.systems.mocap_every.model import Estimate, MLPEstimator, TwoStageEs
 from wearcap.systems.mocap_every.training import WatchRegression
 from wearcap.systems.mocap_every.training_windows import WatchContent
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
+from wearcap.training.base import Optimization
 from wearcap_testing import small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
 TRAININGS = mocap_every.TRAININGS
-SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
+SIZE = TransformerSize(32, 1, 2, 32, 0.0)
+SMALL = ["width=32", "layers=1", "heads=4", "feedforward=32"]
+TWO_STAGE = [f"model.net.transformer.{row}" for row in SMALL]
+OTHERS = {"agrol": SMALL[:2], "mlp": SMALL[:2], "avatarposer": SMALL}
+"""Sizes of the networks that are no two-stage estimators, by the ends of their experiments' names."""
 WEIGHTS = {
     "skate": 0.5,
     "root": 1.0,
@@ -79,11 +85,9 @@ def batch(data: Path):
 def system(net=None, **features) -> WatchRegression:
     estimated = WatchFeatures(**{"frame": "heading"} | features)
     make = net or (
-        lambda **sizes: TwoStageEstimator(
-            **sizes, window=40, width=32, layers=1, heads=2, feedforward=32, hidden=32, dropout=0.0, frames_per_token=2
-        )
+        lambda **sizes: TwoStageEstimator(**sizes, window=40, transformer=SIZE, hidden=32, frames_per_token=2)
     )
-    return WatchRegression(make, estimated, xsens23(), 30.0, WEIGHTS, torch.optim.AdamW, end_weight=2.0)
+    return WatchRegression(make, estimated, xsens23(), 30.0, WEIGHTS, Optimization(torch.optim.AdamW), end_weight=2.0)
 
 
 class Oracle(nn.Module):
@@ -136,7 +140,7 @@ def test_both_stages_and_contacts_are_learned(data):
 def test_contacts_come_before_the_body():
     """The paper's order: the predicted contacts change the predicted body."""
     torch.manual_seed(0)
-    net = TwoStageEstimator(31, 141, 40, 32, 1, 2, 32, 16, 0.0).eval()
+    net = TwoStageEstimator(31, 141, 40, SIZE, 16).eval()
     features = torch.randn(2, 40, 31)
     before = net(features)
     with torch.no_grad():
@@ -147,7 +151,7 @@ def test_contacts_come_before_the_body():
 
 
 def test_one_stage_predicts_no_ends():
-    net = TwoStageEstimator(31, 141, 40, 32, 1, 2, 32, 16, 0.0, multi_stage=False)
+    net = TwoStageEstimator(31, 141, 40, SIZE, 16, multi_stage=False)
     assert net(torch.randn(1, 40, 31)).ends is None
 
 
@@ -190,11 +194,8 @@ def test_the_papers_size():
 @pytest.mark.parametrize("changes", TRAININGS.values(), ids=TRAININGS)
 def test_every_experiment_and_ablation_runs(changes, data, tmp_path):
     run = tmp_path / "run"
-    small = [
-        row
-        for row in SMALL
-        if not changes[0].endswith(("agrol", "mlp")) or row.startswith(("model.net.width", "model.net.layers"))
-    ]
+    other = OTHERS.get(changes[0].rpartition("_")[2])
+    small = TWO_STAGE if other is None else [f"model.net.{row}" for row in other]
     train.main([*arguments("mocap_every", data, run, *small)[1:], *changes])
     trained, config = load_trained(run / "checkpoints" / "last.ckpt")
     assert isinstance(trained, WatchRegression)
@@ -203,7 +204,7 @@ def test_every_experiment_and_ablation_runs(changes, data, tmp_path):
 
 def test_prodigy_may_stand_in_a_checkpoint(data, tmp_path):
     run = tmp_path / "run"
-    train.main(arguments("mocap_every", data, run, *SMALL, "optimizer=prodigy", "optimizer.optimizer.lr=1.0"))
+    train.main(arguments("mocap_every", data, run, *TWO_STAGE, "optimizer=prodigy", "optimizer.optimizer.lr=1.0"))
     assert isinstance(load_trained(run / "checkpoints" / "last.ckpt")[0], WatchRegression)
 
 
@@ -254,7 +255,9 @@ def test_a_trained_estimator_is_evaluated_and_edits_by_cues(data, tmp_path):
 
 def manifold_system() -> ManifoldTraining:
     weights = {"contact": 0.2, "root": 1.0, "rotation": 2.0, "position": 10.0, "velocity": 0.5}
-    return ManifoldTraining(lambda size: MotionManifold(size, 16, 5, 3), xsens23(), 30.0, weights, torch.optim.AdamW)
+    return ManifoldTraining(
+        lambda size: MotionManifold(size, 16, 5, 3), xsens23(), 30.0, weights, Optimization(torch.optim.AdamW)
+    )
 
 
 def test_the_manifold_keeps_time_and_learns(data):

@@ -15,7 +15,7 @@ from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.training_windows import HeadWindow
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 from wearcap.training.losses import joint_velocity, masked_mean
 
 
@@ -37,12 +37,10 @@ class PoseRegression(Training):
         skeleton: Skeleton,
         fps: float,
         loss_weights: dict[str, float],
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
+        optimization: Optimization,
         pairs: int = 4,
-        seed: int = 0,
     ):
-        super().__init__(optimizer, scheduler, loss_weights, seed)
+        super().__init__(optimization, loss_weights)
         self.net = net(feature_size=points.size, motion_size=6 * len(skeleton))
         self.points, self.skeleton, self.fps, self.pairs = points, skeleton, fps, pairs
         self.poses = HeadFeatures(joints=len(skeleton))

@@ -84,11 +84,11 @@ def _no_advertisement(record: logging.LogRecord) -> bool:
 
 
 def _name_embeddings(config: DictConfig) -> None:
-    """Set name and dimension of the image embeddings to those in the data (`surroundings.images=clip`)."""
-    surroundings = config.get("surroundings")
-    if surroundings and surroundings.images and "surroundings" in config.data.dataset.get("content", {}):
+    """Set name and dimension of the image embeddings to those in the data (`surroundings.windows.image.encoder=clip`)."""
+    windows = config.get("surroundings", {}).get("windows", {}).get("image")
+    if windows and "conditions" in config.data.dataset.get("content", {}):
         stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]
-        surroundings.images, surroundings.image_size = embeddings_of(surroundings.images, stores)
+        windows.encoder, config.surroundings.network.image.size = embeddings_of(windows.encoder, stores)
 
 
 def _callbacks(config: DictConfig) -> list[Callback]:

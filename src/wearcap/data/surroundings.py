@@ -2,13 +2,13 @@
 
 import hashlib
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cache, cached_property, partial
 from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from rich.progress import track
 from torch import Tensor
 
@@ -26,8 +26,32 @@ _AT_ONCE = 2048
 """Grids that are encoded at a time."""
 
 
-class PlaceCodes:
+Features = tuple[Float[Tensor, "time feature"], Bool[Tensor, "time"]]
+"""Features of a condition, and which frames have them; elsewhere they are any finite numbers."""
+
+
+class ConditionWindows:
+    """A condition in training windows: its features at the frames of a recording's head stream."""
+
+    metric: ClassVar[bool] = False
+    """Whether features depend on lengths, so that windows cannot be scaled."""
+    size: int
+    """Number of features of a frame, known after `prepare`."""
+    encoder: Any = None
+    """The network that made them, or its name; None: none did."""
+
+    def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
+        """Make or check what reading the recordings of a split needs."""
+
+    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool) -> Features:
+        """Features of frames start…stop-1; `mirrored`: of everything mirrored left to right."""
+        raise NotImplementedError
+
+
+class PlaceCodes(ConditionWindows):
     """Codes of the points around the body by a trained voxel autoencoder (thesis §6.2)."""
+
+    metric = True
 
     def __init__(self, checkpoint: str | Path):
         """`checkpoint`: path or name of a checkpoint of experiment=voxel_autoencoder."""
@@ -39,7 +63,7 @@ class PlaceCodes:
         return load_network(self.checkpoint, VoxelAutoencoder, "voxel_autoencoder").requires_grad_(False)
 
     @property
-    def size(self) -> int:
+    def size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.encoder.size
 
     @cached_property
@@ -74,50 +98,45 @@ class PlaceCodes:
             write_tensors(path, {"code": code, "code_mirrored": code_mirrored})
         return path
 
-    def prepare(self, store: RecordingStore, names: Iterable[str]) -> None:
+    def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
         """Compute the missing codes of recordings."""
-        folder = store.root / "cache" / f"places-{self.fingerprint}"
-        todo = [name for name in names if not (folder / f"{store.entries[name].sha256}.safetensors").is_file()]
-        for name in track(todo, f"points of {store.root.name}", disable=not todo):
-            self.file_of(store.root, store.entries[name])
+        for store in stores:
+            folder = store.root / "cache" / f"places-{self.fingerprint}"
+            codes = {name: folder / f"{store.entries[name].sha256}.safetensors" for name in store.names(split)}
+            todo = [name for name, file in codes.items() if not file.is_file()]
+            for name in track(todo, f"points of {store.root.name}", disable=not todo):
+                self.file_of(store.root, store.entries[name])
+
+    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool) -> Features:
+        """See `ConditionWindows`. Raises WearcapError as `file_of` does."""
+        codes = _codes(str(self.file_of(store.root, store.entries[name])))
+        rows, count = codes.get_slice("code_mirrored" if mirrored else "code"), stop - start
+        if not rows.get_shape()[0]:
+            return torch.zeros(count, self.size), torch.zeros(count, dtype=torch.bool)
+        return rows[start:stop].float(), torch.ones(count, dtype=torch.bool)
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """Modalities that windows contain; None leaves one out (no columns)."""
+class Embeddings(ConditionWindows):
+    """Embeddings of the recordings' cameras by one encoder."""
 
-    places: PlaceCodes | None = None
-    images: str | None = None
-    """Name of the encoder whose embeddings are read from the recordings' cameras."""
+    def __init__(self, encoder: str):
+        self.encoder, self.size = encoder, 0
 
-    def read(
-        self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int
-    ) -> dict[str, Tensor]:
-        """Point codes ("points") and image embeddings ("image") of frames start…stop-1 of the head stream, and which
-        frames have them ("points_valid", "image_valid"); with `mirrored`, of the surroundings mirrored left to right.
+    def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
+        _, self.size = embeddings_of(self.encoder, [*stores])
 
-        Raises WearcapError as `PlaceCodes.file_of` does.
-        """
+    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool) -> Features:
         path, count = store.path_of(name), stop - start
-        points, points_valid = torch.zeros(count, 0), torch.zeros(count, dtype=torch.bool)
-        if self.places is not None:
-            points = torch.zeros(count, self.places.size)
-            codes = _codes(str(self.places.file_of(store.root, store.entries[name])))
-            rows = codes.get_slice("code_mirrored" if mirrored else "code")
-            if rows.get_shape()[0]:
-                points, points_valid = rows[start:stop].float(), torch.ones(count, dtype=torch.bool)
-        image, image_valid = torch.zeros(count, image_size), torch.zeros(count, dtype=torch.bool)
+        image, valid = torch.zeros(count, self.size), torch.zeros(count, dtype=torch.bool)
         key = "camera.embedding_mirrored" if mirrored else "camera.embedding"
-        if self.images is not None and _pictured(path) == self.images and key in open_recording(path).keys:
-            picture, image_valid = (part[start:stop] for part in _latest(path))
-            if image_valid.any():
-                first, last = picture[image_valid][[0, -1]].tolist()
+        if _pictured(path) == self.encoder and key in open_recording(path).keys:
+            picture, valid = (part[start:stop] for part in _latest(path))
+            if valid.any():
+                first, last = picture[valid][[0, -1]].tolist()
                 shown = open_recording(path).window(key, first, last + 1).float()
                 image = shown[(picture - first).clamp(0, len(shown) - 1)]
-        return {"points": points, "points_valid": points_valid, "image": image, "image_valid": image_valid}
+        return image, valid
 
-
-NOTHING = Surroundings()
 
 _ENCODER_NAME = re.compile(r"[\w.-]+")
 """Names become values of the training's config, in which `${…}` would be resolved."""

@@ -267,12 +267,30 @@ class Scale:
 
 
 @dataclass(frozen=True)
+class WatchErrors:
+    """Further errors of watches, standard deviations within a window where they say no other."""
+
+    tilt_deg: float = 0.0
+    """Of gravity as each watch knows it, about both horizontal axes: its world is turned, and a part of gravity taken for
+    acceleration."""
+    bias_m_s2: float = 0.0
+    """Of accelerations, in the watch's axes."""
+    play_deg: float = 0.0
+    """Largest angle by which a strap gives under the arm's acceleration."""
+    delay_s: float = 0.0
+    """Of each watch against the head; negative ones are early."""
+    silent: float = 0.0
+    """Share of windows in which a watch is silent for half a second or longer. As in captures, its orientation is then
+    the last one, and its acceleration zero (`sensors.watches.bridged`)."""
+
+
+@dataclass(frozen=True)
 class SensorErrors:
     """Errors of trackers and watches, of the floor and of the body's size.
 
     They are constant within a window, where they say no other, and standard deviations, those of orientations about each
     axis and of positions along each. Values that a window lacks are left out. Random numbers are drawn for the first
-    seven in any case, for the others unless they are 0.
+    seven in any case, for those of `watches` unless they are 0.
     """
 
     head_deg: float = 0.0
@@ -287,37 +305,18 @@ class SensorErrors:
     """Where a wrist's sensor is, in its own axes: a watch there has that place's acceleration."""
     size: float = 0.0
     """Of each measure of the body's size, as a share."""
-    tilt_deg: float = 0.0
-    """Root mean square angle by which gravity, as the head's tracking knows it, is off: its world is turned about a
-    horizontal axis through the window's first head."""
-    jitter_m: float = 0.0
-    """Of the head's tracked place, changing over 0.4 s."""
-    jitter_deg: float = 0.0
-    """Of the head's tracked orientation, likewise."""
-    drift: float = 0.0
-    """Of the head's tracked place after a metre of its path, as a share; it grows with the path's square root."""
-    watch_tilt_deg: float = 0.0
-    """Of gravity as each watch knows it, about both horizontal axes: its world is turned, and a part of gravity taken for
-    acceleration."""
-    bias_m_s2: float = 0.0
-    """Of accelerations, in the watch's axes."""
-    play_deg: float = 0.0
-    """Largest angle by which a strap gives under the arm's acceleration."""
-    delay_s: float = 0.0
-    """Of each watch against the head; negative ones are early."""
-    silent: float = 0.0
-    """Share of windows in which a watch is silent for half a second or longer. As in captures, its orientation is then
-    the last one, and its acceleration zero (`sensors.watches.bridged`)."""
+    slam: SlamNoise | None = None
+    """Of the head's tracked path; None: none."""
+    watches: WatchErrors = WatchErrors()
 
     def __call__(self, window: Window, random: Draws) -> Window:
         """What moves differently or at another time comes first, what is measured wrongly follows."""
-        generator = random.generator
-        if self.tilt_deg or self.jitter_m or self.jitter_deg or self.drift:
-            slam = SlamNoise(self.jitter_m, self.jitter_deg, drift_share=self.drift, lean_deg=self.tilt_deg)
-            window = _tracked(window, slam, generator)
-        window = _worn(window, ((_slack, self.play_deg), (_delayed, self.delay_s)), generator)
+        generator, watches = random.generator, self.watches
+        if self.slam is not None:
+            window = _tracked(window, self.slam, generator)
+        window = _worn(window, ((_slack, watches.play_deg), (_delayed, watches.delay_s)), generator)
         window = _constant(window, self, generator)
-        measured = (_tilted, self.watch_tilt_deg), (_biased, self.bias_m_s2), (_silenced, self.silent)
+        measured = (_tilted, watches.tilt_deg), (_biased, watches.bias_m_s2), (_silenced, watches.silent)
         return _worn(window, measured, generator)
 
 

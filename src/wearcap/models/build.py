@@ -38,6 +38,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.model": ("MotionDenoiser",),
     "wearcap.systems.echo.model": ("EchoDenoiser",),
     "wearcap.models.image_encoder": ("EgoViewEncoder",),
+    "wearcap.models.layers": ("TransformerSize",),
     "wearcap.models.motion_autoencoder": ("MotionAutoencoder",),
     "wearcap.systems.mocap_every.manifold": ("MotionManifold",),
     "wearcap.models.point_encoder": ("ObjectNetwork", "PointNeXt"),
@@ -46,8 +47,9 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.ireplica.training": ("ContactDetection",),
     "wearcap.systems.echo.training": ("EchoDiffusion",),
     "wearcap.systems.hmd2.egoview_training": ("EgoView",),
+    "wearcap.training.base": ("Optimization",),
     "wearcap.training.motion_autoencoder": ("MotionEncoding",),
-    "wearcap.systems.hmd2.training": ("MotionDiffusion",),
+    "wearcap.systems.hmd2.training": ("Levels", "Loss", "MotionDiffusion"),
     "wearcap.systems.mocap_every.manifold_training": ("ManifoldTraining",),
     "wearcap.systems.echo.object_training": ("ObjectEncoding",),
     "wearcap.training.schedules": ("warmup_cosine",),
@@ -63,10 +65,26 @@ MOVED = {
     "wearcap.systems.hmd2.point_codes_training.VoxelReconstruction": "wearcap.systems.hmd2.voxel_autoencoder_training.VoxelReconstruction"
 }
 """Targets that files of before name, and where they are now."""
-RENAMED = {"wearcap.diffusion.levels.LevelMix": {"whole": "fully_observed"}}
+_DIFFUSION = "wearcap.systems.hmd2.training.MotionDiffusion"
+RENAMED = {
+    "wearcap.diffusion.levels.LevelMix": {"whole": "fully_observed"},
+    _DIFFUSION: {"level_tilt": "tilt", "loss_weights": "weights"},
+}
 """Settings that files of before have under another name, by target."""
 STRUCK = {"object_in_wrists": False}
 """Settings that went, with the value at which files of before have them and do without."""
+
+_NETWORKS = ("hmd2.model.MotionDenoiser", "echo.model.EchoDenoiser", "mocap_every.model.TwoStageEstimator")
+_TRANSFORMER = {"transformer": ("wearcap.models.layers.TransformerSize", "width layers heads feedforward dropout")}
+GROUPED: dict[str, dict[str, tuple[str, str]]] = {
+    **{f"wearcap.systems.{name}": _TRANSFORMER for name in _NETWORKS},
+    _DIFFUSION: {
+        "levels": ("wearcap.systems.hmd2.training.Levels", "tilt pure"),
+        "loss": ("wearcap.systems.hmd2.training.Loss", "weights tail contact_share"),
+    },
+}
+"""Settings that files of before have side by side: by target and group, the group's class and their names."""
+_OPTIMIZATION = {"optimization": ("wearcap.training.base.Optimization", "optimizer scheduler seed")}
 
 _TARGET, _PARTIAL = "_target_", "_partial_"
 MAX_VALUES, MAX_TEXT = 10_000, 1000
@@ -91,6 +109,12 @@ def brought_up_to_date(config: Any) -> None:
             for old, new in RENAMED.get(target, {}).items():
                 if old in part:
                     part[new] = part.pop(old)
+            if target == _DIFFUSION and "place_encoder" in part:
+                part["conditions"] = _conditions(*(part.pop(old) for old in _CONDITIONS))
+            trains = "optimizer" in part and not target.endswith(".Optimization")
+            for group, (kind, names) in (GROUPED.get(target, {}) | (_OPTIMIZATION if trains else {})).items():
+                if found := {old: part.pop(old) for old in names.split() if old in part}:
+                    part[group] = {_TARGET: kind} | found
         for name in [name for name, off in STRUCK.items() if name in part and part[name] is off]:
             del part[name]
 
@@ -103,6 +127,15 @@ def _parts(config: Any) -> Iterator[dict[str, Any]]:
         if isinstance(value, dict):
             yield value
         rest += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+
+
+_CONDITIONS = ("place_encoder", "image_encoder", "image_size", "drop")
+
+
+def _conditions(places: Any, images: Any, size: Any, drop: Any) -> dict[str, Any]:
+    """HMD²'s conditions beside the head from the settings that it had for points and images."""
+    points = {"points": {"encoder": places, "drop": drop}} if places else {}
+    return points | ({"image": {"encoder": images, "size": size, "drop": drop}} if images else {})
 
 
 def check_config(config: Any, where: str | Path) -> None:
@@ -158,9 +191,6 @@ def build(config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path
     check_config(config, where)
     own = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
     needed = sum(value.numel() * value.element_size() for value in own.values())
-    for part in _parts(config):  # a module that makes tensors when it is imported must not make them without memory
-        if _TARGET in part:
-            target_of(part[_TARGET])
     try:
         with torch.device("meta"), _Rehearsal(ALLOWANCE + TIMES_WEIGHTS * needed):
             rehearsed = _made(config)
@@ -182,7 +212,8 @@ def target_of(name: str) -> Callable[..., Any]:
     if not _is_known(name):
         raise KeyError(name)
     module, _, attribute = name.rpartition(".")
-    return getattr(importlib.import_module(module), attribute)
+    with torch.device("cpu"):  # constants of a module that is imported in a rehearsal have values
+        return getattr(importlib.import_module(module), attribute)
 
 
 def _made(value: Any) -> Any:

@@ -1,6 +1,7 @@
 """Blocks shared by the transformers: rotary attention, adaptive layer norm, level embedding."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,6 +9,17 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wearcap.errors import require_choice
+
+
+@dataclass(frozen=True)
+class TransformerSize:
+    """A stack of transformer blocks."""
+
+    width: int
+    layers: int
+    heads: int
+    feedforward: int
+    dropout: float
 
 
 class LevelEmbedding(nn.Module):
@@ -126,14 +138,14 @@ class MixingBlock(nn.Module):
 
 
 def denoiser_block(
-    mixing: str, width: int, heads: int, feedforward: int, max_tokens: int, dropout: float, streams: int = 1
+    mixing: str, size: TransformerSize, max_tokens: int, streams: int = 1
 ) -> AdaptiveBlock | MixingBlock:
-    """A block of a denoiser, whose tokens see each other by "attention", or in an "mlp" without `heads`, `feedforward`
-    and `dropout`. Raises WearcapError for other ways."""
+    """A block of a denoiser, whose tokens see each other by "attention", or in an "mlp" without heads, feedforward
+    and dropout. Raises WearcapError for other ways."""
     require_choice(mixing, ("attention", "mlp"), f"a denoiser has no mixing {mixing!r}")
     if mixing == "mlp":
-        return MixingBlock(width, max_tokens * streams)
-    return AdaptiveBlock(width, heads, feedforward, max_tokens, dropout, streams)
+        return MixingBlock(size.width, max_tokens * streams)
+    return AdaptiveBlock(size.width, size.heads, size.feedforward, max_tokens, size.dropout, streams)
 
 
 class Normalizer(nn.Module):

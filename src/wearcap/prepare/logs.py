@@ -39,6 +39,54 @@ Numbers = Sequence[float | int]
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What shows a trajectory's scale and vertical, as files and numbers of the config; times count from the first pose."""
+
+    points: str | None = None
+    standing: Numbers | None = None
+    camera_height_m: float | int | None = None
+    head_imu: str | None = None
+    T_cam_imu: Numbers | None = None
+    walks: Sequence[Numbers] | None = None
+
+    def cloud(self, read: TrajectoryFile) -> PointCloud | None:
+        """The points in the trajectory's world, from which its origin is taken off, too."""
+        return None if self.points is None else read_cloud(self.points, read.origin)
+
+    def of(self, read: TrajectoryFile, unit_m: float | None, up: Tensor | None) -> SceneEvidence:
+        """What is known of a file whose unit of length and vertical may be known."""
+        start_s = read.trajectory.timestamps[0].item()
+        cloud = self.cloud(read)
+        return SceneEvidence(
+            None if cloud is None else cloud.points_world,
+            None if self.standing is None else _times(self.standing, 2, "standing", start_s),
+            None if self.camera_height_m is None else float(self.camera_height_m),
+            None if self.head_imu is None else read_head_imu(self.head_imu),
+            pose_of(self.T_cam_imu, "T_cam_imu"),
+            tuple((*_times(walk[:2], 2, "walks", start_s), float(walk[2])) for walk in self.walks or ()),
+            unit_m if unit_m is not None else 1.0 if read.metric else None,
+            up,
+        )
+
+
+@dataclass(frozen=True)
+class HeadVideo:
+    """The head camera's video, its intrinsics, and the time of its first frame after the first pose (s)."""
+
+    video: str | None = None
+    camera: str | None = None
+    start_s: float | int = 0.0
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """Poses that accelerate more (m/s²) are outliers, and interpolated; a longer stretch that deviates is no burst."""
+
+    max_acceleration: float | int = 40.0
+    max_burst_s: float | int = 1.0
+
+
+@dataclass(frozen=True)
 class TrajectorySettings:
     """How a trajectory becomes a head's path in metres, z up; None: from the file's content."""
 
@@ -49,21 +97,14 @@ class TrajectorySettings:
     unit: str | float | int = AUTO
     T_head_device: Numbers | None = None
     height: float | int | None = None
-    points: str | None = None
-    standing: Numbers | None = None
-    camera_height_m: float | int | None = None
-    head_imu: str | None = None
-    T_cam_imu: Numbers | None = None
-    walks: Sequence[Numbers] | None = None
-    video: str | None = None
-    camera: str | None = None
-    video_start_s: float | int = 0.0
-    max_acceleration: float | int = 40.0
-    max_burst_s: float | int = 1.0
+    evidence: Evidence = Evidence()
+    video: HeadVideo = HeadVideo()
+    outliers: Outliers = Outliers()
 
     def files(self) -> list[Path]:
         """The other files that a recording is made of; a video counts by its size."""
-        return [Path(file) for file in (self.points, self.head_imu, self.camera) if file is not None]
+        parts = self.evidence.points, self.evidence.head_imu, self.video.camera
+        return [Path(file) for file in parts if file is not None]
 
     def skeleton(self) -> Skeleton | None:
         return None if self.height is None else skeleton_of_height(float(self.height))
@@ -71,30 +112,6 @@ class TrajectorySettings:
     def mount(self) -> Rigid:
         """T_head_device: the given one, else the nominal one of glasses and headsets."""
         return pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
-
-    def cloud(self, read: TrajectoryFile) -> PointCloud | None:
-        """The points in the trajectory's world, from which its origin is taken off, too."""
-        return None if self.points is None else read_cloud(self.points, read.origin)
-
-    def evidence(self, read: TrajectoryFile, up: Tensor | None) -> SceneEvidence:
-        """What is known of scale and vertical; times of the config count from the first pose."""
-        start_s = read.trajectory.timestamps[0].item()
-        standing = None if self.standing is None else _times(self.standing, 2, "standing", start_s)
-        walks = tuple((*_times(walk[:2], 2, "walks", start_s), float(walk[2])) for walk in self.walks or ())
-        imu = None if self.head_imu is None else read_head_imu(self.head_imu)
-        unit_m = Conventions(unit=self.unit).unit_m
-        scale = unit_m if unit_m is not None else 1.0 if read.metric else None
-        cloud = self.cloud(read)
-        return SceneEvidence(
-            None if cloud is None else cloud.points_world,
-            standing,
-            None if self.camera_height_m is None else float(self.camera_height_m),
-            imu,
-            pose_of(self.T_cam_imu, "T_cam_imu"),
-            walks,
-            scale,
-            up,
-        )
 
 
 def _times(values: Numbers, count: int, name: str, start_s: float) -> tuple[float, float]:
@@ -143,14 +160,14 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     unit, fps = settings.time_unit, settings.fps
     read = read_trajectory_file(file, unit, None if fps is None else float(fps))
     head, alignment, note = head_of(read, settings, str(file))
-    points = settings.cloud(read)
+    points = settings.evidence.cloud(read)
     if points is not None:
         points = replace(points, points_world=alignment.points(points.points_world))
     origin = origin_of(read, alignment)
     floor = None
-    if settings.camera_height_m is not None:
+    if settings.evidence.camera_height_m is not None:
         floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
-    camera = _camera(settings, head)
+    camera = _camera(settings.video, head)
     skeleton = settings.skeleton()
     if skeleton is None:
         note += "; height not given: taken from how high the head is carried, where the floor is known"
@@ -175,8 +192,8 @@ def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> t
     axes, up, vertical = _axes(read, settings, where)
     R_device_cam = DEVICES[axes].mT @ CAMERA
     slam = replace(read.trajectory, R_world_body=read.trajectory.R_world_body @ R_device_cam)
-    evidence = settings.evidence(read, up)
-    limits = float(settings.max_acceleration), float(settings.max_burst_s)
+    evidence = settings.evidence.of(read, Conventions(unit=settings.unit).unit_m, up)
+    limits = float(settings.outliers.max_acceleration), float(settings.outliers.max_burst_s)
     alignment, clean, outliers = align_cleaned(slam, evidence.align, *limits)
     track = to_head_axes(alignment.apply(clean), DeviceAxes("z", "camera", 1.0, ""))
     mount = settings.mount()
@@ -191,9 +208,10 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
     stated = Conventions(up=settings.up, axes=settings.axes)
     require_choice(stated.axes, (AUTO, *DEVICES), f"a trajectory with axes={stated.axes}")
     given = stated.axes if stated.axes != AUTO or not read.of_camera else "camera"
-    if settings.head_imu is not None or (settings.points and settings.standing and settings.camera_height_m):
+    known = settings.evidence
+    if known.head_imu is not None or (known.points and known.standing and known.camera_height_m):
         device = "camera" if given == "auto" else given
-        return device, None, f"vertical by the {'head sensor' if settings.head_imu is not None else 'floor'}"
+        return device, None, f"vertical by the {'head sensor' if known.head_imu is not None else 'floor'}"
     try:
         axes = device_axes(read.trajectory, stated.up, given, where, read.usual)
     except WearcapError:
@@ -213,24 +231,24 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
     return axes.device, WORLDS[axes.up], f"{axes.up} is up{level} ({axes.known_by})"
 
 
-def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | None:
-    """The video's camera, which looks along the device's forward axis: its frames begin `video_start_s` after the first pose."""
-    if settings.video is None:
+def _camera(of: HeadVideo, head: HeadStream) -> CameraStream | None:
+    """The video's camera, which looks along the device's forward axis: its frames begin `start_s` after the first pose."""
+    if of.video is None:
         return None
-    if settings.camera is None:
+    if of.camera is None:
         fix = "Calibrate it: wearcap calibrate source=VIDEO; then camera=camera.json."
-        raise WearcapError("a video without its camera's intrinsics", settings.video, fix=fix)
-    info, lens = video_info(settings.video), read_camera(settings.camera)
+        raise WearcapError("a video without its camera's intrinsics", of.video, fix=fix)
+    info, lens = video_info(of.video), read_camera(of.camera)
     if not info.frames or not info.fps:
-        raise WearcapError("a video that does not say how many frames it has", settings.video, "a whole video")
-    start = head.timestamps[0].item() + float(settings.video_start_s)
+        raise WearcapError("a video that does not say how many frames it has", of.video, "a whole video")
+    start = head.timestamps[0].item() + float(of.start_s)
     times = start + torch.arange(info.frames, dtype=torch.float64) / float(info.fps)
     if times[-1] < head.timestamps[0] or times[0] > head.timestamps[-1]:
         what = f"the video from {times[0]:.2f} to {times[-1]:.2f} s"
         expected = f"it and the path, {head.timestamps[0]:.2f} to {head.timestamps[-1]:.2f} s, at the same time"
-        raise WearcapError(what, settings.video, expected, "Give video_start_s=SECONDS.")
+        raise WearcapError(what, of.video, expected, "Give video_start_s=SECONDS.")
     R = head.R_head_device @ CAMERA
-    return CameraStream(times, lens, R, head.t_head_device, video=str(Path(settings.video).absolute()))
+    return CameraStream(times, lens, R, head.t_head_device, video=str(Path(of.video).absolute()))
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,15 @@ from wearcap.sensors.simulated import heading_walk, smooth_noise
 GRAVITY = 9.81
 """m/s², downwards along the world's z."""
 
+ATTITUDE_PERIOD_S = 8.0
+
 
 @dataclass(frozen=True)
 class ImuNoise:
     """Errors of a watch-like sensor; zeros make it perfect."""
 
     attitude_deg: float = 1.5
-    attitude_period_s: float = 8.0
+    """Error of the attitude, which varies over `ATTITUDE_PERIOD_S`."""
     heading_walk_deg_per_sqrt_min: float = 1.0
     acc_noise: float = 0.04
     """White noise of each axis (m/s²)."""
@@ -111,7 +113,7 @@ def synthesize_imu(
         acc_imu = acc_imu + _normal(rng, 1, 3) * noise.acc_bias + _normal(rng, len(R), 3) * noise.acc_noise
         gyro = gyro + _normal(rng, len(R), 3) * np.deg2rad(noise.gyro_noise_deg_s)
         # The sensor estimates its orientation with a slowly varying attitude error and a drifting heading.
-        attitude = smooth_noise(rng, len(R), 3, noise.attitude_period_s, fps)
+        attitude = smooth_noise(rng, len(R), 3, ATTITUDE_PERIOD_S, fps)
         attitude = np.deg2rad(noise.attitude_deg) * attitude / np.sqrt(3)
         heading = heading_walk(rng, len(R), noise.heading_walk_deg_per_sqrt_min, fps)
         if noise.heading_deg:

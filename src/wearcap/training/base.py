@@ -1,14 +1,24 @@
 """The base of the LightningModules: seeded steps, optimiser from the config, logged losses."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import lightning
 import torch
 from torch import Tensor
 
-OptimizerOf = Callable[..., torch.optim.Optimizer]
-SchedulerOf = Callable[..., torch.optim.lr_scheduler.LRScheduler] | None
+
+@dataclass(frozen=True)
+class Optimization:
+    """How weights are found."""
+
+    optimizer: Callable[..., torch.optim.Optimizer]
+    """Called with the trained parameters."""
+    scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None
+    """Called with the optimiser; it advances every step. None: a constant learning rate."""
+    seed: int = 0
+    """Seed of dropout and augmentation."""
 
 
 class Training(lightning.LightningModule):
@@ -22,17 +32,9 @@ class Training(lightning.LightningModule):
     parts: ClassVar[tuple[str, ...]] = ()
     """Attributes that are constructor arguments of the system's pipeline."""
 
-    def __init__(
-        self,
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
-        loss_weights: dict[str, float] | None = None,
-        seed: int = 0,
-    ):
-        """`optimizer` is called with the trained parameters, `scheduler` with the optimiser; it advances every step."""
+    def __init__(self, optimization: Optimization, loss_weights: dict[str, float] | None = None):
         super().__init__()
-        self.loss_weights, self.seed = dict(loss_weights or {}), seed
-        self._optimizer, self._scheduler = optimizer, scheduler
+        self.optimization, self.loss_weights = optimization, dict(loss_weights or {})
 
     def set_statistics(self, dataset: Any) -> None:
         """Compute normalisation from a training split; a resumed run loads it with the weights."""
@@ -62,7 +64,7 @@ class Training(lightning.LightningModule):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Make dropout and augmentation of a step a function of seed and step, so that resumed runs repeat it."""
-        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
+        torch.manual_seed((self.optimization.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def _step(self, batch: tuple[Tensor, ...], stage: str) -> Tensor:
         measured = self.measure(batch)
@@ -83,7 +85,7 @@ class Training(lightning.LightningModule):
         self._step(batch, "val")
 
     def configure_optimizers(self):
-        optimizer = self._optimizer([each for each in self.parameters() if each.requires_grad])
-        if self._scheduler is None:
+        optimizer = self.optimization.optimizer([each for each in self.parameters() if each.requires_grad])
+        if (scheduler := self.optimization.scheduler) is None:
             return optimizer
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"}}
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler(optimizer), "interval": "step"}}

@@ -9,7 +9,7 @@ from wearcap.data.motion_features import MotionFeatures, Movement
 from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.models.motion_autoencoder import MotionAutoencoder
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 
 MIN_SCALE = 0.02
 """Smallest standard deviation that features are divided by: those that hardly vary would become mostly noise."""
@@ -19,14 +19,9 @@ class MotionEncoding(Training):
     """Reconstruction of windows of true motion; the loss is the smooth L1 of normalised features."""
 
     def __init__(
-        self,
-        net: Callable[..., MotionAutoencoder],
-        features: MotionFeatures,
-        window: int,
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
+        self, net: Callable[..., MotionAutoencoder], features: MotionFeatures, window: int, optimization: Optimization
     ):
-        super().__init__(optimizer, scheduler)
+        super().__init__(optimization)
         self.features, self.window = features, window
         self.net = net(size=features.size, frames=window // features.every)
 

@@ -13,6 +13,7 @@ from wearcap.models.layers import (
     MotionEncoder,
     Normalizer,
     TemporalBlend,
+    TransformerSize,
     Widening,
     attention_mask,
     denoiser_block,
@@ -39,29 +40,22 @@ class EchoDenoiser(nn.Module):
 
     def __init__(
         self,
-        human_size: int,
-        object_size: int,
-        contact_size: int,
+        sizes: tuple[int, int, int],
         condition_size: int,
         object_condition_size: int,
         window: int,
-        width: int,
-        layers: int,
-        heads: int = 8,
-        feedforward: int = 2048,
-        dropout: float = 0.1,
+        transformer: TransformerSize,
         streams: int = 1,
         context: int = 7,
         blend: int = 0,
         mixing: str = "attention",
     ):
-        """`context`: frames before and after its own that the convolution over conditions sees. `mixing`: see
+        """`sizes` of the modalities. `context`: frames before and after its own that the convolution over conditions sees. `mixing`: see
         `denoiser_block`."""
         super().__init__()
         if streams not in (1, len(MODALITIES)):
             raise ValueError(f"{streams} streams, but there are {len(MODALITIES)} modalities")
-        self.window, self.streams = window, streams
-        self.sizes = (human_size, object_size, contact_size)
+        self.window, self.streams, self.sizes, width = window, streams, sizes, transformer.width
         self.motion_normalizer = Normalizer(sum(self.sizes))
         self.condition_normalizer = Normalizer(condition_size)
         # One more channel marks valid frames: padding would otherwise look like the mean condition.
@@ -73,7 +67,7 @@ class EchoDenoiser(nn.Module):
         self.levels = nn.ModuleList(LevelEmbedding(width) for _ in self.sizes)
         self.stream = nn.Parameter(0.02 * torch.randn(streams, width)) if streams > 1 else None
         self.blocks = nn.ModuleList(
-            denoiser_block(mixing, width, heads, feedforward, window, dropout, streams) for _ in range(layers)
+            denoiser_block(mixing, transformer, window, streams) for _ in range(transformer.layers)
         )
         self.norm = nn.LayerNorm(width)
         self.heads = nn.ModuleList(nn.Linear(width, size) for size in self.sizes)

@@ -20,7 +20,7 @@ from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.models.point_encoder import ObjectNetwork, bounds, to_unit_sphere
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 
 _KEY = "made_of"
 _TEMPERATURE = 0.1
@@ -119,11 +119,9 @@ class ObjectEncoding(Training):
     Each cloud is normalised by itself, and batch norm keeps its own statistics: none are set before.
     """
 
-    def __init__(
-        self, net: ObjectNetwork, loss_weights: dict[str, float], optimizer: OptimizerOf, scheduler: SchedulerOf = None
-    ):
+    def __init__(self, net: ObjectNetwork, loss_weights: dict[str, float], optimization: Optimization):
         """`loss_weights` of the terms "category", "extents" and "instance"."""
-        super().__init__(optimizer, scheduler, loss_weights)
+        super().__init__(optimization, loss_weights)
         self.net = net
 
     def terms(self, batch: _ObjectViews) -> dict[str, Tensor]:

@@ -22,7 +22,7 @@ from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import EchoModel
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 
 STANDING = 0.73
 """Share of the training frames in which a foot's patch is on the floor."""
@@ -53,19 +53,15 @@ class EchoDiffusion(Training):
         skeleton: Skeleton,
         loss_weights: dict[str, float],
         levels: LevelMix,
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
+        optimization: Optimization,
         encoder: PointNeXt | None = None,
         contacts: bool = True,
-        seed: int = 0,
     ):
         """`encoder` (frozen) computes the objects' features. `contacts` False leaves that modality out, as in ECHO's
         ablation."""
-        super().__init__(optimizer, scheduler, loss_weights, seed)
+        super().__init__(optimization, loss_weights)
         self.net = net(
-            human_size=features.human_size,
-            object_size=OBJECT_SIZE,
-            contact_size=CONTACTS,
+            sizes=(features.human_size, OBJECT_SIZE, CONTACTS),
             condition_size=features.condition_size,
             object_condition_size=features.object_condition_size,
         )

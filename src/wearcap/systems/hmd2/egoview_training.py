@@ -9,7 +9,7 @@ from wearcap.metrics.detection import average_precision
 from wearcap.models.image_encoder import EgoViewEncoder, letterboxed
 from wearcap.models.layers import Normalizer
 from wearcap.systems.hmd2.egoview_frames import HANDS, POINTS, EgoFrame, EgoFrames, half_mirrored, relit, turned
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 
 LEAST_SPREAD_M = 0.02
 
@@ -25,14 +25,12 @@ class EgoView(Training):
     def __init__(
         self,
         net: EgoViewEncoder,
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
+        optimization: Optimization,
         dropout: float = 0.0,
         augment: bool = True,
         turn_deg: float = 6.0,
-        seed: int = 0,
     ):
-        super().__init__(optimizer, scheduler, seed=seed)
+        super().__init__(optimization)
         self.net, self.heads = net, nn.Linear(net.size, 4 * len(POINTS))
         self.normalizer = Normalizer(3 * len(POINTS))
         self.dropout, self.augment, self.turn_deg = nn.Dropout(dropout), augment, turn_deg

@@ -2,6 +2,7 @@
 same motion."""
 
 from dataclasses import asdict
+from inspect import Parameter, Signature
 from typing import Any
 
 import msgspec
@@ -12,43 +13,40 @@ from torch import Tensor, nn
 from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
-from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.runtime import graphs
-from wearcap.runtime.graphs import ROT6D, Call, Count, Exports, Graph, Rate, Run
+from wearcap.runtime.graphs import ROT6D, Count, Exports, Graph, Rate, Run
 from wearcap.scene.voxels import VoxelGrid
+from wearcap.systems.hmd2.conditions import CONDITIONS, Condition, Exported
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
+from wearcap.systems.hmd2.pipeline import HMD2, Overlap, Sampling
+from wearcap.systems.hmd2.windows import DiffusionModel
 from wearcap.tracking.refinement import Refinement
 
 SETTINGS = ("steps", "stride", "eta", "spacing", "guidance", "inpaint", "fade", "lookahead", "live", "use")
 
 
-class _ConditionGraph(nn.Module):
-    """The part of a denoiser that is computed once per window: the encoding of its conditions."""
+def condition_graph(net: MotionDenoiser, inputs: dict[str, Tensor]) -> Graph:
+    """The part of a denoiser that is computed once per window: the encoding of its conditions, each by its name."""
 
-    def __init__(self, net: MotionDenoiser):
-        super().__init__()
-        self.net = net
+    class ConditionGraph(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.net = net
 
-    def forward(
-        self,
-        head: Float[Tensor, "batch time head_feature"],
-        valid: Bool[Tensor, "batch time"],
-        points: Float[Tensor, "batch time point_feature"] | None = None,
-        points_valid: Bool[Tensor, "batch time"] | None = None,
-        image: Float[Tensor, "batch time image_feature"] | None = None,
-        image_valid: Bool[Tensor, "batch time"] | None = None,
-    ) -> Float[Tensor, "batch token width"]:
-        none = head[..., :0]
-        conditions = Conditions(
-            head,
-            none if points is None else points,
-            valid if points_valid is None else points_valid,
-            none if image is None else image,
-            valid if image_valid is None else image_valid,
-        )
-        return self.net.encode(conditions, valid)
+        def forward(self, **inputs: Tensor) -> Float[Tensor, "batch token width"]:
+            head, parts = inputs["head"], [(inputs[name], inputs[f"{name}_valid"]) for name in self.net.conditions]
+            others, given = torch.cat([head[..., :0], *(part for part, _ in parts)], -1), head[..., :0].bool()
+            given = torch.stack([valid for _, valid in parts], -1) if parts else given
+            return self.net.encode(Conditions(head, others, given), inputs["valid"])
+
+    # Inputs of an exported graph are named by its signature.
+    names = [
+        Parameter("self", Parameter.POSITIONAL_ONLY),
+        *(Parameter(name, Parameter.KEYWORD_ONLY) for name in inputs),
+    ]
+    ConditionGraph.forward.__signature__ = Signature(names)  # pyright: ignore[reportFunctionMemberAccess]
+    return Graph(ConditionGraph(), inputs)
 
 
 def exports(pipeline: HMD2) -> Exports:
@@ -66,17 +64,15 @@ def exports(pipeline: HMD2) -> Exports:
     valid, normalizer = made["step"].inputs["valid"], net.condition_encoder.normalizer
     noise = torch.randn(*shape, len(normalizer.scale), generator=random)
     inputs = {"head": normalizer.mean.cpu() + normalizer.scale.cpu() * noise, "valid": valid}
-    for name, size in (("points", net.points_size), ("image", net.image_size)):
-        if size:
-            present = valid & (torch.rand(shape, generator=random) < 0.7)
-            inputs |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": present}
-    made["conditions"] = Graph(_ConditionGraph(net), inputs)
-    if model.place_encoder is not None and net.points_size:
-        grid = model.place_encoder.grid
-        grids = grid.clip_m * torch.rand(2, *[grid.cells] * 3, generator=random)
-        made["places"] = Graph(Call(model.place_encoder, "encode"), {"grids": grids})
+    for name, size in net.conditions.items():
+        present = valid & (torch.rand(shape, generator=random) < 0.7)
+        inputs |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": present}
+    made["conditions"] = condition_graph(net, inputs)
+    for condition in model.conditions.values():
+        made |= condition.graphs(random)
+    conditions = {name: _entry(condition) for name, condition in model.conditions.items()}
     feet = ["left_foot.contact", "right_foot.contact"] if features.contacts else []
-    settings = asdict(pipeline.sampling) | asdict(pipeline.overlap) | {"live": pipeline.live, "use": list(pipeline.use)}
+    settings = asdict(pipeline.sampling) | asdict(pipeline.overlap) | {"live": pipeline.live, "use": [*pipeline.used]}
     about = {
         "window": pipeline.window,
         "fps": model.fps,
@@ -88,12 +84,24 @@ def exports(pipeline: HMD2) -> Exports:
         "motion_channels": [*(f"{joint}.{entry}" for joint in model.skeleton.joint_names for entry in ROT6D), *feet],
         "motion_mean": net.motion_normalizer.mean.tolist(),
         "motion_scale": net.motion_normalizer.scale.tolist(),
-        **{name: getattr(net, name) for name in ("condition_size", "points_size", "image_size", "self_conditioning")},
-        "image_encoder": model.image_encoder,
-        "grid": None if model.place_encoder is None else asdict(model.place_encoder.grid),
+        "condition_size": net.condition_size,
+        "self_conditioning": net.self_conditioning,
+        "conditions": conditions,
+        # Points and images apart, as files of before have them.
+        "points_size": net.conditions.get("points", 0),
+        "image_size": net.conditions.get("image", 0),
+        "image_encoder": conditions.get("image", {}).get("encoder"),
+        "grid": conditions.get("points", {}).get("grid"),
         "skeleton": graphs.skeleton_to_json(model.skeleton),
     }
     return Exports("hmd2", made, about)
+
+
+def _entry(condition: Condition) -> dict[str, Any]:
+    """What the sidecar holds of a condition."""
+    encoder = condition.encoder
+    named, grid = encoder if isinstance(encoder, str) else None, getattr(encoder, "grid", None)
+    return msgspec.to_builtins(Exported(condition.size, named, grid))
 
 
 def condition_channels(features: HeadFeatures) -> list[str]:
@@ -116,7 +124,7 @@ class _ExportedDenoiser(MotionDenoiser):
         nn.Module.__init__(self)  # no blocks of its own
         self._runs = (runs,)
         self.window, self.condition_size = about.window, about.condition_size
-        self.points_size, self.image_size = about.points_size, about.image_size
+        self.conditions = {name: entry.size for name, entry in about.others().items()}
         self.self_conditioning = about.self_conditioning
         self.motion_size = len(about.motion_mean)
         self.motion_normalizer = Normalizer(self.motion_size)
@@ -124,27 +132,14 @@ class _ExportedDenoiser(MotionDenoiser):
 
     def encode(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch token width"]:
         inputs = {"head": conditions.head, "valid": valid}
-        if self.points_size:
-            inputs |= {"points": conditions.points, "points_valid": conditions.points_valid}
-        if self.image_size:
-            inputs |= {"image": conditions.image, "image_valid": conditions.image_valid}
+        parts = conditions.others.split([*self.conditions.values()], -1)
+        for name, part, given in zip(self.conditions, parts, conditions.given.unbind(-1)):
+            inputs |= {name: part, f"{name}_valid": given}
         return self._runs[0]["conditions"](**inputs)
 
     def graphs(self, window: int | None = None) -> dict[str, Graph]:
         """The exported graphs themselves, whose window is fixed."""
         return {"step": Graph(self._runs[0]["model"], {}), "plan": Graph(self._runs[0]["plan"], {})}
-
-
-class _ExportedPlaces(VoxelAutoencoder):
-    """The encoder of the points around the body, with its weights in an exported file."""
-
-    def __init__(self, run: Run, grid: VoxelGrid, size: int):
-        nn.Module.__init__(self)
-        self._run, self.grid, self.size = run, grid, size
-
-    def encode(self, grids: Float[Tensor, "*batch x y z"]) -> Float[Tensor, "*batch feature"]:
-        flat = grids.reshape(-1, *grids.shape[-3:])
-        return self._run(grids=flat).reshape(*grids.shape[:-3], self.size)
 
 
 class Sidecar(msgspec.Struct):
@@ -159,22 +154,30 @@ class Sidecar(msgspec.Struct):
     motion_mean: list[float]
     motion_scale: list[float]
     condition_size: Count
-    points_size: Count
-    image_size: Count
     self_conditioning: bool
-    image_encoder: str | None
+    conditions: dict[str, Exported] | None = None
+    points_size: Count = 0
+    image_size: Count = 0
+    image_encoder: str | None = None
     grid: VoxelGrid | None = None
     refinement: dict[str, Any] | None = None
+
+    def others(self) -> dict[str, Exported]:
+        """The conditions beside the head; files of before have those of points and images apart."""
+        if self.conditions is not None:
+            return self.conditions
+        former = {
+            "points": Exported(self.points_size, grid=self.grid),
+            "image": Exported(self.image_size, self.image_encoder),
+        }
+        return {name: entry for name, entry in former.items() if entry.size}
 
 
 def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: Sidecar) -> HMD2:
     """The pipeline of an exported model."""
-    places = None
-    if "places" in runs and about.grid is not None:
-        places = _ExportedPlaces(runs["places"], about.grid, about.points_size)
+    conditions = {name: CONDITIONS[name].of_export(entry, runs) for name, entry in about.others().items()}
     schedule, skeleton = graphs.schedule_from_json(about.schedule), about.skeleton.skeleton()
-    net = _ExportedDenoiser(runs, about)
-    model = DiffusionModel(net, about.features, schedule, skeleton, about.fps, places, about.image_encoder)
+    model = DiffusionModel(_ExportedDenoiser(runs, about), about.features, schedule, skeleton, about.fps, conditions)
     sampling, overlap = (msgspec.convert(about.settings, kind) for kind in (Sampling, Overlap))
     live, use = bool(about.settings["live"]), tuple(about.settings["use"])
     return HMD2(model, sampling, overlap, use, Refinement.of(about.refinement), live)

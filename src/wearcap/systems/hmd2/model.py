@@ -3,6 +3,7 @@
 `StepRunner` runs its steps at a fixed sequence of levels, in any runtime.
 """
 
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from wearcap.models.layers import (
     MotionEncoder,
     Normalizer,
     TemporalBlend,
+    TransformerSize,
     Widening,
     attention_mask,
     denoiser_block,
@@ -24,15 +26,13 @@ from wearcap.runtime.graphs import Graph, LevelPlan, PlanGraph, StepGraph, chose
 
 
 class Conditions(NamedTuple):
-    """Conditioning of a window, not normalised. Where a "valid" flag is False the features are any finite numbers."""
+    """Conditioning of a window, not normalised."""
 
     head: Float[Tensor, "batch time head_feature"]
-    points: Float[Tensor, "batch time point_feature"]
-    """Code of the points around the body (`VoxelAutoencoder`); no columns for a network without points."""
-    points_valid: Bool[Tensor, "batch time"]
-    image: Float[Tensor, "batch time image_feature"]
-    """Embedding of the head camera's image; no columns for a network without images."""
-    image_valid: Bool[Tensor, "batch time"]
+    others: Float[Tensor, "batch time feature"]
+    """Features of the network's other conditions side by side; of a condition that a frame lacks any finite numbers."""
+    given: Bool[Tensor, "batch time condition"]
+    """Which of these conditions each frame has."""
 
 
 class OptionalInput(nn.Module):
@@ -65,25 +65,24 @@ class ConditionEncoder(nn.Module):
     head sway, not in one frame.
     """
 
-    def __init__(
-        self, head_size: int, points_size: int, image_size: int, width: int, frames_per_token: int, context: int
-    ):
+    def __init__(self, head_size: int, sizes: Mapping[str, int], width: int, frames_per_token: int, context: int):
         super().__init__()
         # One more channel marks valid frames: padding would otherwise look like the mean condition.
         self.normalizer = Normalizer(head_size)
         self.widen = Widening(head_size + 1, 2 * width, frames_per_token, context)
-        self.points = OptionalInput(points_size, 2 * width, frames_per_token) if points_size else None
-        self.image = OptionalInput(image_size, 2 * width, frames_per_token) if image_size else None
+        self.sizes = dict(sizes)
+        for name, size in sizes.items():
+            self.add_module(name, OptionalInput(size, 2 * width, frames_per_token))
         self.narrow = nn.Linear(2 * width, width)
 
     def forward(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch token width"]:
         mask = valid[..., None].to(conditions.head.dtype)
         frames = torch.cat([self.normalizer(conditions.head) * mask, mask], -1)
         wide = self.widen(frames)
-        if self.points is not None:
-            wide = wide + self.points(conditions.points, conditions.points_valid & valid)
-        if self.image is not None:
-            wide = wide + self.image(conditions.image, conditions.image_valid & valid)
+        for name, x, given in zip(
+            self.sizes, conditions.others.split([*self.sizes.values()], -1), conditions.given.unbind(-1)
+        ):
+            wide = wide + self.get_submodule(name)(x, given & valid)
         return self.narrow(F.gelu(wide))
 
 
@@ -101,37 +100,29 @@ class MotionDenoiser(nn.Module):
         self,
         motion_size: int,
         condition_size: int,
-        window: int = 240,
-        width: int = 512,
-        layers: int = 8,
-        heads: int = 8,
-        feedforward: int = 1024,
-        dropout: float = 0.1,
+        window: int,
+        transformer: TransformerSize,
         frames_per_token: int = 1,
         blend: int = 0,
         context: int = 14,
-        points_size: int = 0,
-        image_size: int = 0,
+        conditions: Mapping[str, int] | None = None,
         self_conditioning: bool = False,
         mixing: str = "attention",
     ):
-        """`mixing`: see `denoiser_block`. `points_size` and `image_size` 0 leave a modality out; else one network runs with and without it."""
+        """`mixing`: see `denoiser_block`. `conditions`: sizes of those beside the head; a network runs with and without each."""
         super().__init__()
         if window % frames_per_token:
             raise ValueError(f"a window of {window} frames does not split into tokens of {frames_per_token}")
-        self.window, self.frames_per_token = window, frames_per_token
+        self.window, self.frames_per_token, width = window, frames_per_token, transformer.width
         self.motion_size, self.condition_size = motion_size, condition_size
-        self.points_size, self.image_size = points_size, image_size
+        self.conditions = dict(conditions or {})
         self.self_conditioning = self_conditioning
         self.motion_normalizer = Normalizer(motion_size)
-        self.condition_encoder = ConditionEncoder(
-            condition_size, points_size, image_size, width, frames_per_token, context
-        )
+        self.condition_encoder = ConditionEncoder(condition_size, self.conditions, width, frames_per_token, context)
         self.motion_encoder = MotionEncoder(motion_size * (2 if self_conditioning else 1), width, frames_per_token)
         self.level = LevelEmbedding(width)
         self.blocks = nn.ModuleList(
-            denoiser_block(mixing, width, heads, feedforward, window // frames_per_token, dropout)
-            for _ in range(layers)
+            denoiser_block(mixing, transformer, window // frames_per_token) for _ in range(transformer.layers)
         )
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, frames_per_token * motion_size)

@@ -1,6 +1,6 @@
 """HMD² (thesis ch. 6): environment-aware full-body capture from a head-mounted device by conditional diffusion."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -17,8 +17,9 @@ from wearcap.recording import Motion, Recording
 from wearcap.runtime.needs import HEAD, HEIGHT, POINTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.runtime.windows import FinalPoses, batched, cut, over_path
+from wearcap.systems.hmd2.conditions import CONDITIONS
 from wearcap.systems.hmd2.model import Conditions, StepRunner
-from wearcap.systems.hmd2.sensing import MODALITIES, Sensing
+from wearcap.systems.hmd2.sensing import Sensing
 from wearcap.systems.hmd2.windows import DiffusionModel, Frames, Predicted, WindowSampler, blended
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import floor_from_points
@@ -37,7 +38,7 @@ class Sampling:
     spacing: float = 1.0
     """Spacing of the steps' noise levels (`diffusion.process.step_levels`)."""
     guidance: float = 1.0
-    """Scale of classifier-free guidance by points and images (Ho & Salimans 2022; ours); 1 turns it off."""
+    """Scale of classifier-free guidance by the conditions beside the head (Ho & Salimans 2022; ours); 1 turns it off."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ class HMD2(LearnedSystem):
     model: DiffusionModel
     sampling: Sampling = Sampling()
     overlap: Overlap = Overlap()
-    use: Sequence[str] = MODALITIES
-    """Modalities that condition the model, of those that it was trained on and the recording contains."""
+    use: Sequence[str] | None = None
+    """Conditions beside the head, of those that the model was trained on and the recording contains; None: all."""
     refinement: Refinement | None = None
     """How predicted motion is refined (ours); None: it stays as predicted."""
     live: bool = False
@@ -84,8 +85,14 @@ class HMD2(LearnedSystem):
 
     def __post_init__(self):
         self._steps: StepRunner | None = None
-        if unknown := set(self.use) - set(MODALITIES):
-            raise WearcapError(f"no modality {min(unknown)!r}", expected=f"some of {', '.join(MODALITIES)}")
+        known = [kind.use for kind in CONDITIONS.values()]
+        if unknown := set(self.used) - set(known):
+            raise WearcapError(f"no condition {min(unknown)!r}", expected=f"some of {', '.join(known)}")
+
+    @property
+    def used(self) -> Collection[str]:
+        """Conditions that are used, of those that the model and the recording have."""
+        return [kind.use for kind in CONDITIONS.values()] if self.use is None else self.use
 
     @property
     def window(self) -> int:
@@ -166,9 +173,9 @@ class HMD2(LearnedSystem):
 
     def sense(self, recording: Recording, path: HeadPath) -> Frames:
         """Steps 2 and 3: the conditions of a whole recording. Raises WearcapError as `Sensing.of` does."""
-        sensing, floor = Sensing.of(self.model, self.use, recording, path.stature), None
+        sensing, floor = Sensing.of(self.model, self.used, recording, path.stature), None
         if not self.live:  # from the points where they are used, else from the head's path
-            cloud = recording.points if sensing.uses_points else None
+            cloud = recording.points if "points" in sensing.sensed else None
             floor = floor_from_points(cloud, path.T_world_head.t, path.stature)
             floor = path.floor_height if floor is None else floor
         return sensing.frames(path.timestamps, path.T_world_device, path.T_world_head, floor)
@@ -178,8 +185,7 @@ class HMD2(LearnedSystem):
         net, guidance = self.model.net, self.sampling.guidance
         encoded, unguided = net.encode(conditions, valid), None
         if guidance != 1.0:
-            none = torch.zeros_like(valid)
-            unguided = net.encode(conditions._replace(points_valid=none, image_valid=none), valid)
+            unguided = net.encode(conditions._replace(given=torch.zeros_like(conditions.given)), valid)
         steps, number, last = self._steps, 0, None
         assert steps is not None
 
@@ -222,8 +228,7 @@ class HMD2(LearnedSystem):
         valid = frames.valid & (number < torch.tensor([[sampler.count] for sampler in samplers]))
         size = torch.stack([sampler.size for sampler in samplers])
         head = features.condition(frames.R_world_head, frames.t_world_head, frames.floor_height, size, self.model.fps)
-        parts = head, frames.points, frames.points_valid, frames.image, frames.image_valid
-        conditions = Conditions(*(part.to(device) for part in parts))
+        conditions = Conditions(*(part.to(device) for part in (head, frames.others, frames.given)))
         # The last window's poses are re-expressed in this window's canonical frame, which may have moved.
         observed = net.motion_normalizer(
             features.encode(predicted.R_parent_joint, frames.R_world_head, predicted.foot_contact).to(device)

@@ -36,7 +36,7 @@ class HMD2Stream(HeadStream):
     def _begin(self) -> None:
         super()._begin()
         pipeline, stature = self.pipeline, self.wearer.skeleton.height_of("head")
-        self.sensing = Sensing(pipeline.model, pipeline.use, stature, self.memory)
+        self.sensing = Sensing(pipeline.model, pipeline.used, stature, self.memory)
 
     def take(self, sample: Any) -> None:
         if isinstance(sample, HeadSample):
@@ -45,21 +45,14 @@ class HMD2Stream(HeadStream):
             self._head_input.refuse("head", packets.WRONG_TYPE)
 
     def _checked(self, sample: HeadSample) -> HeadSample:
-        head, sensing, embedding = self._head_input, self.sensing, None
-        points = head.points(sample.points_world) if sensing.uses_points else None
-        if sensing.uses_images and sample.embedding is not None:
-            size = self.pipeline.model.net.image_size
-            if fault := packets.values_fault(sample.embedding, (size,), packets.MAX_FEATURE):
-                head.refuse("embedding", fault)
-                embedding = torch.full((size,), torch.nan)  # no image is used until the next valid one
-            else:
-                embedding = packets.owned(sample.embedding)
+        head, fields = self._head_input, {condition.field: condition for condition in self.sensing.used.values()}
+        parts = {name: fields[name].checked(getattr(sample, name), head) for name in fields if hasattr(sample, name)}
         floor_m = sample.floor_height
         if floor_m is not None and (fault := packets.number_fault(floor_m, packets.MAX_POSITION_M)):
             head.refuse("floor height", fault)
             floor_m = None
         floor_m = None if floor_m is None else float(floor_m)
-        return HeadSample(float(sample.timestamp), head.pose(sample.T_world_device), points, embedding, floor_m)
+        return HeadSample(float(sample.timestamp), head.pose(sample.T_world_device), floor_height=floor_m, **parts)
 
     def _accept(self, sample: HeadSample) -> None:
         super()._accept(sample)
@@ -130,14 +123,14 @@ class HMD2Session(Session):
         of another length than the network's as long as none of the right length has arrived; later ones are refused.
         """
         wearers = zip(self.streams, samples) if not self.embedded else ()
-        for sample in (sample for stream, part in wearers if stream.sensing.uses_images for sample in part):
-            embedding, size = getattr(sample, "embedding", None), self.system.model.net.image_size
-            if isinstance(embedding, Tensor) and embedding.shape == (size,):
+        for sample in (sample for stream, part in wearers if "image" in stream.sensing.sensed for sample in part):
+            embedding, image = getattr(sample, "embedding", None), self.system.model.conditions["image"]
+            if isinstance(embedding, Tensor) and embedding.shape == (image.size,):
                 self.embedded = True
                 break
             if isinstance(embedding, Tensor) and embedding.ndim == 1:
                 when = "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"
-                expected = f"{size} of {self.system.model.image_encoder!r}, which the network was trained on"
+                expected = f"{image.size} of {image.encoder!r}, which the network was trained on"
                 raise WearcapError(f"an embedding of {len(embedding)} features at {when}", expected=expected)
         super().push(samples)
 

@@ -1,6 +1,6 @@
 """Training windows of HMD² and of its baseline: head paths with the true pose and what surrounds the wearer."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,11 +12,12 @@ from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.bodies import OtherPerson
 from wearcap.data.features import body_size, on_level_ground, true_foot_contact
-from wearcap.data.surroundings import NOTHING, Surroundings, embeddings_of
+from wearcap.data.surroundings import ConditionWindows
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, open_recording
 from wearcap.errors import WearcapError
 from wearcap.recording.store import RecordingFile, RecordingStore
+from wearcap.systems.hmd2.conditions import CONDITIONS, side_by_side
 from wearcap.tracking.floor import floor_from_path, floor_from_points
 
 MIN_FRAMES = 30
@@ -39,16 +40,14 @@ class HeadWindow(NamedTuple):
     """`body_size` of the wearer (m)."""
     foot_contact: Float[Tensor, "*batch time foot"]
     """1 where heel or toes of the left and right foot touch the floor."""
-    points: Float[Tensor, "*batch time point_feature"]
-    points_valid: Bool[Tensor, "*batch time"]
-    image: Float[Tensor, "*batch time image_feature"]
-    image_valid: Bool[Tensor, "*batch time"]
-    """Points and images: see `Surroundings.read`; no columns for a modality that is left out."""
+    others: Float[Tensor, "*batch time feature"]
+    given: Bool[Tensor, "*batch time condition"]
+    """The other conditions: see `model.Conditions`."""
     noise: Float[Tensor, "*batch time motion"]
     level: Float[Tensor, "*batch 1"]
-    chance: Float[Tensor, "*batch 3"]
-    """Diffusion noise and level, and uniform random numbers that decide on dropped modalities and self-conditioning;
-    drawn here so that they depend on seed and step, not on the process."""
+    chance: Float[Tensor, "*batch choice"]
+    """Diffusion noise and level, and uniform random numbers that decide on dropping each of `CONDITIONS` and on
+    self-conditioning; drawn here so that they depend on seed and step, not on the process."""
 
     def joints_from_head(
         self, skeleton: Skeleton, R_parent_joint: Float[Tensor, "batch frame joint 3 3"]
@@ -71,24 +70,21 @@ class _HeadTrack:
     constants: dict[str, Tensor]
     twins: dict[str, list[int]]
     surrounded: bool
-    """Whether points and pictures belong to this body."""
+    """Whether what surrounds it belongs to this body."""
 
 
 class HeadContent(Content):
-    """Windows of head paths and motions. Codes of points are computed where they are missing."""
+    """Windows of head paths and motions, with other conditions by their names."""
 
     draws = ("shift", "mirror", "ends", "end")
     any_body = True
 
-    def __init__(self, surroundings: Surroundings = NOTHING):
-        self.surroundings, self.image_size = surroundings, 0
+    def __init__(self, conditions: Mapping[str, ConditionWindows] | None = None):
+        self.conditions = dict(conditions or {})
 
     def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
-        if self.surroundings.places is not None:
-            for store in stores:
-                self.surroundings.places.prepare(store, store.names(split))
-        if self.surroundings.images is not None:
-            _, self.image_size = embeddings_of(self.surroundings.images, [*stores])
+        for condition in self.conditions.values():
+            condition.prepare(stores, split)
 
     def min_frames(self, window: int, stretch: float) -> int:
         return MIN_FRAMES
@@ -132,22 +128,21 @@ class HeadContent(Content):
         return Window(values | track.constants, track.twins)
 
     def item(self, track: _HeadTrack, cut: Cut, window: Window, random: Draws) -> HeadWindow:
-        """Raises WearcapError where points were scaled, which codes do not follow."""
-        if window.scale != 1 and self.surroundings.places is not None:
-            fix = "Leave out transforms.scale, or the points (surroundings=head)."
-            raise WearcapError("codes of points cannot be scaled", fix=fix)
+        """Raises WearcapError where a condition was scaled that does not follow."""
+        metric = [name for name, condition in self.conditions.items() if condition.metric]
+        if window.scale != 1 and metric:
+            fix = f"Leave out transforms.scale, or {', '.join(metric)} (surroundings=head)."
+            raise WearcapError(f"codes of {metric[0]} cannot be scaled", fix=fix)
         start, stop = cut.bounds
-        seen = self.surroundings.read(track.store, track.name, start, stop, window.mirrored, self.image_size)
+        read = [one.read(track.store, track.name, start, stop, window.mirrored) for one in self.conditions.values()]
+        others, given = side_by_side(read, stop - start)
+        frames = cut.frames - start
         return HeadWindow(
             **window.values,
             valid=cut.valid,
-            **{
-                name: part[cut.frames - start] & track.surrounded
-                if name.endswith("valid")
-                else part[cut.frames - start]
-                for name, part in seen.items()
-            },
+            others=others[frames],
+            given=given[frames] & track.surrounded,
             noise=torch.randn(cut.count, 6 * len(track.constants["t_parent_joint"]) + FEET, generator=random.generator),
             level=torch.rand(1, generator=random.generator),
-            chance=torch.rand(3, generator=random.generator),
+            chance=torch.rand(len(CONDITIONS) + 1, generator=random.generator),
         )

@@ -14,7 +14,7 @@ from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import HeadStream
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.voxels import VoxelGrid, VoxelMap, mirrored
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 
 
 class Places(NamedTuple):
@@ -62,8 +62,8 @@ class PlaceContent(Content):
 class VoxelReconstruction(Training):
     """Trains an autoencoder of voxel grids by the network's own reconstruction loss."""
 
-    def __init__(self, net: VoxelAutoencoder, optimizer: OptimizerOf, scheduler: SchedulerOf = None):
-        super().__init__(optimizer, scheduler)
+    def __init__(self, net: VoxelAutoencoder, optimization: Optimization):
+        super().__init__(optimization)
         self.net = net
 
     def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:

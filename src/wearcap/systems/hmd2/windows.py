@@ -6,7 +6,8 @@ noise, which is drawn per frame and moves along with its frame: successive windo
 by what the later window has seen since, and after the last final frame that difference fades out over `fade` frames.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -16,8 +17,8 @@ from torch import Tensor
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.features import body_size
 from wearcap.diffusion.schedule import Schedule
-from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.runtime.windows import StretchWindows, appended, cut
+from wearcap.systems.hmd2.conditions import Condition
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 
@@ -32,9 +33,8 @@ class DiffusionModel:
     skeleton: Skeleton
     """Skeleton for recordings without one of their own."""
     fps: float
-    place_encoder: VoxelAutoencoder | None = None
-    image_encoder: str | None = None
-    """Name of the encoder whose embeddings the network was trained on."""
+    conditions: Mapping[str, Condition] = field(default_factory=dict)
+    """The network's conditions beside the head, in its order."""
 
 
 class Frames(NamedTuple):
@@ -44,10 +44,8 @@ class Frames(NamedTuple):
     R_world_head: Float[Tensor, "batch time 3 3"]
     t_world_head: Float[Tensor, "batch time 3"]
     floor_height: Float[Tensor, "batch time"]
-    points: Float[Tensor, "batch time point_feature"]
-    points_valid: Bool[Tensor, "batch time"]
-    image: Float[Tensor, "batch time image_feature"]
-    image_valid: Bool[Tensor, "batch time"]
+    others: Float[Tensor, "batch time feature"]
+    given: Bool[Tensor, "batch time condition"]
     valid: Bool[Tensor, "batch time"]
     """False where the head pose is missing and after a recording's end; other fields are any finite numbers there."""
 

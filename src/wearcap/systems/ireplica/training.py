@@ -23,7 +23,7 @@ from wearcap.systems.ireplica.features import PoseFeatures
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.scores import score_interactions
 from wearcap.systems.ireplica.training_windows import ContactWindow
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 from wearcap.training.callbacks import is_due
 
 
@@ -38,11 +38,9 @@ class ContactDetection(Training):
         features: PoseFeatures,
         classes: list[str],
         fps: float,
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
-        seed: int = 0,
+        optimization: Optimization,
     ):
-        super().__init__(optimizer, scheduler, seed=seed)
+        super().__init__(optimization)
         self.net = net(inputs=features.size, classes=len(classes))
         self.features, self.classes, self.fps = features, tuple(classes), fps
         self._validated: list[tuple[Tensor, Tensor]] = []

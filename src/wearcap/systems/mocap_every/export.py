@@ -12,7 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.runtime.graphs import Count, Exports, Rate, Run, SkeletonEntry, skeleton_to_json
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
-from wearcap.systems.mocap_every.pipeline import SETTINGS, MocapEvery, WatchModel
+from wearcap.systems.mocap_every.pipeline import MocapEvery, Overlap, WatchModel
 from wearcap.tracking.refinement import Refinement
 
 
@@ -31,7 +31,7 @@ def exports(pipeline: MocapEvery) -> Exports:
         "window": net.window,
         "fps": pipeline.model.fps,
         "skeleton": skeleton_to_json(pipeline.model.skeleton),
-        "settings": {name: getattr(pipeline, name) for name in SETTINGS},
+        "settings": pipeline.settings(),
         "refinement": None if pipeline.refinement is None else asdict(pipeline.refinement),
     }
     return Exports("mocap_every", {"network": net.graph(features.size)}, about)
@@ -64,4 +64,7 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
     """The pipeline of an exported model."""
     net = _ExportedEstimator(runs["model"], about.window)
     model = WatchModel(net, about.features, about.skeleton.skeleton(), about.fps)
-    return MocapEvery(model, refinement=Refinement.of(about.refinement), **about.settings)
+    own = {name: about.settings[name] for name in ("floor", "carried", "anchor")}
+    return MocapEvery(
+        model, msgspec.convert(about.settings, Overlap), refinement=Refinement.of(about.refinement), **own
+    )

@@ -10,7 +10,7 @@ from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.systems.mocap_every.manifold import MotionManifold, Posed
 from wearcap.systems.mocap_every.training_windows import WatchWindow
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 
 
 class ManifoldTraining(Training):
@@ -26,10 +26,9 @@ class ManifoldTraining(Training):
         skeleton: Skeleton,
         fps: float,
         loss_weights: dict[str, float],
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
+        optimization: Optimization,
     ):
-        super().__init__(optimizer, scheduler, loss_weights)
+        super().__init__(optimization, loss_weights)
         self.net = net(size=FEET + 3 + 6 * len(skeleton))
         self.skeleton, self.fps = skeleton, fps
 

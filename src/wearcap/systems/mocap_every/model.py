@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from wearcap.body.skeleton import FEET
-from wearcap.models.layers import MixingBlock, Normalizer, TemporalBlend, attention_mask
+from wearcap.models.layers import MixingBlock, Normalizer, TemporalBlend, TransformerSize, attention_mask
 from wearcap.runtime.graphs import Graph
 
 ENDS_SIZE = 12
@@ -54,12 +54,8 @@ class TwoStageEstimator(WatchEstimator):
         feature_size: int,
         motion_size: int,
         window: int,
-        width: int,
-        layers: int,
-        heads: int,
-        feedforward: int,
+        transformer: TransformerSize,
         hidden: int,
-        dropout: float,
         multi_stage: bool = True,
         frames_per_token: int = 1,
         blend: int = 0,
@@ -72,11 +68,12 @@ class TwoStageEstimator(WatchEstimator):
         self.feature_normalizer, self.motion_normalizer = Normalizer(feature_size), Normalizer(motion_size)
         self.ends_normalizer = Normalizer(ENDS_SIZE)
         tokens = window // frames_per_token
-        per = frames_per_token
+        per, size, width = frames_per_token, transformer, transformer.width
 
         def encoder() -> nn.TransformerEncoder:
-            layer = nn.TransformerEncoderLayer(width, heads, feedforward, dropout, batch_first=True, norm_first=True)
-            return nn.TransformerEncoder(layer, layers, nn.LayerNorm(width), enable_nested_tensor=False)
+            more = {"batch_first": True, "norm_first": True}
+            layer = nn.TransformerEncoderLayer(width, size.heads, size.feedforward, size.dropout, **more)
+            return nn.TransformerEncoder(layer, size.layers, nn.LayerNorm(width), enable_nested_tensor=False)
 
         def head(inputs: int, outputs: int) -> nn.Sequential:
             return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, per * outputs))

@@ -1,7 +1,8 @@
 """MocapEvery (Lee and Joo 2024): full-body motion from two watches and a head-mounted camera, on stairs and hills."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -33,8 +34,6 @@ from wearcap.tracking.head_path import HeadPath, head_path
 from wearcap.tracking.refinement import Measured, Refinement, refined_over
 
 FLOORS = ("follow", "update", "points", "fixed")
-SETTINGS = ("stride", "lookahead", "floor", "carried", "anchor", "mirror_average")
-"""Settings that a motion depends on; an exported model carries them along."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,23 +59,30 @@ class WatchModel:
     """Frame rate of the estimator (Hz)."""
 
 
+@dataclass(frozen=True)
+class Overlap:
+    """How successive windows continue each other."""
+
+    stride: int = 20
+    """Frames by which windows advance; 1: frame by frame."""
+    lookahead: int = 20
+    """Frames that must follow a pose before it is final (latency)."""
+    mirror_average: bool = True
+    """Mirror test-time augmentation: the prediction for the mirrored window is averaged in (ours)."""
+
+
 @dataclass
 class MocapEvery(LearnedSystem):
     """Captures recordings: the estimator runs on overlapping windows, the floor is updated from window to window."""
 
     model: WatchModel
-    stride: int = 20
-    """Frames by which windows advance; 1: frame by frame."""
-    lookahead: int = 20
-    """Frames that must follow a pose before it is final (latency)."""
+    overlap: Overlap = Overlap()
     floor: str = "follow"
     """follow: ours. update: the paper's D.2. points: below the head, from points only. fixed: constant height."""
     carried: float = CARRIED
     """How high the head is carried while upright, as a share of its height in the rest pose (ours); 1: as in that pose."""
     anchor: bool = True
     """Whether the body is anchored to the measured head (ours) or keeps the estimator's translation (the paper)."""
-    mirror_average: bool = True
-    """Mirror test-time augmentation: the prediction for the mirrored window is averaged in (ours)."""
     refinement: Refinement | None = None
     """How estimated motion is refined (ours); None: it stays as estimated."""
     cues: VisualCues | None = None
@@ -97,9 +103,9 @@ class MocapEvery(LearnedSystem):
         self._run: Run | None = None
         self._backend = chosen(self.runtime, self.precision, self.device)
         require_choice(self.floor, FLOORS, f"no floor {self.floor!r}")
-        window = self.model.net.window
-        if not 0 < self.stride <= window or not 0 <= self.lookahead <= window - self.stride:
-            what = f"windows of {window} frames with stride {self.stride} and lookahead {self.lookahead}"
+        window, stride, lookahead = self.model.net.window, self.overlap.stride, self.overlap.lookahead
+        if not 0 < stride <= window or not 0 <= lookahead <= window - stride:
+            what = f"windows of {window} frames with stride {stride} and lookahead {lookahead}"
             expected = "a stride from 1 to the window, and a lookahead of at most the overlap of two windows"
             raise WearcapError(what, expected=expected)
 
@@ -112,7 +118,7 @@ class MocapEvery(LearnedSystem):
     def latency_s(self) -> float:
         """Longest time between a frame and its final pose (s), with the future frames of the watches' mean filter."""
         refinement = 0 if self.refinement is None else self.refinement.lookahead
-        return (self.stride - 1 + self.lookahead + refinement + FILTER / 2) / self.model.fps
+        return (self.overlap.stride - 1 + self.overlap.lookahead + refinement + FILTER / 2) / self.model.fps
 
     def prepare(self) -> None:
         """Move the network to its device and set up its runtime, compiled or exported once."""
@@ -203,7 +209,8 @@ class MocapEvery(LearnedSystem):
 
     def motion(self, final: FinalPoses, skeleton: Skeleton) -> Motion:
         """Step 4: estimated poses as a motion, anchored to the measured head."""
-        motion = final.motion(skeleton, self.settings())
+        about = self.settings() | {"refinement": self.refinement}
+        motion = final.motion(skeleton, {"pipeline": "mocap_every"} | {name: str(about[name]) for name in about})
         return anchored_to_head(motion, final.T_world_head) if self.anchor else motion
 
     def _follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:
@@ -213,6 +220,6 @@ class MocapEvery(LearnedSystem):
             return FloorFollow(initial_m, skeleton.height_of("left_toe"), self.model.fps)
         return FloorFixed(initial_m)
 
-    def settings(self) -> dict[str, str]:
-        """Settings that the motion depends on, for its provenance."""
-        return {"pipeline": "mocap_every"} | {name: str(getattr(self, name)) for name in (*SETTINGS, "refinement")}
+    def settings(self) -> dict[str, Any]:
+        """Settings that a motion depends on, which an exported model carries along."""
+        return asdict(self.overlap) | {"floor": self.floor, "carried": self.carried, "anchor": self.anchor}

@@ -38,7 +38,7 @@ class MocapEveryStream(HeadAndWristsStream):
     """
 
     def __init__(self, pipeline: MocapEvery, wearer: Wearer):
-        super().__init__(pipeline, wearer, pipeline.stride, needs_s=(FILTER // 2 + 0.5) / pipeline.fps)
+        super().__init__(pipeline, wearer, pipeline.overlap.stride, needs_s=(FILTER // 2 + 0.5) / pipeline.fps)
         self._begin()
 
     def _begin(self) -> None:

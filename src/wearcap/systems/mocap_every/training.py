@@ -16,7 +16,7 @@ from wearcap.systems.mocap_every.model import TrainedEstimator
 from wearcap.systems.mocap_every.pipeline import MocapEvery, WatchModel
 from wearcap.systems.mocap_every.training_windows import WatchWindow
 from wearcap.training import losses
-from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+from wearcap.training.base import Optimization, Training
 
 
 class WatchRegression(Training):
@@ -38,15 +38,13 @@ class WatchRegression(Training):
         skeleton: Skeleton,
         fps: float,
         loss_weights: dict[str, float],
-        optimizer: OptimizerOf,
-        scheduler: SchedulerOf = None,
+        optimization: Optimization,
         end_weight: float = 1.0,
         contact_share: float | None = None,
-        seed: int = 0,
     ):
         """`end_weight`: weight of hands and feet relative to the other joints in "position". `contact_share`: share of
         the labels with contact, by which both classes weigh alike in "contact"; None: plain cross entropy."""
-        super().__init__(optimizer, scheduler, loss_weights, seed)
+        super().__init__(optimization, loss_weights)
         self.net = net(feature_size=features.size, motion_size=features.motion_size)
         self.features, self.skeleton, self.fps = features, skeleton, fps
         self.contact_share = contact_share

@@ -65,8 +65,8 @@ class EstimatorWindows(StretchWindows[Frames]):
         self, timestamps: Float64[Tensor, "time"], sensed: Sensed, floor_height: Float[Tensor, "time"] | None = None
     ) -> None:
         """Take in any number of frames; `floor_height` (m): where it is not followed but known."""
-        for first in range(0, len(timestamps), self._pipeline.stride):
-            part = slice(first, first + self._pipeline.stride)
+        for first in range(0, len(timestamps), self._pipeline.overlap.stride):
+            part = slice(first, first + self._pipeline.overlap.stride)
             if floor_height is not None:
                 self._floor = FloorFixed(floor_height[first].item())
             self._advance(timestamps[part], Sensed(*(field[part] for field in sensed)))
@@ -91,11 +91,11 @@ class EstimatorWindows(StretchWindows[Frames]):
         self._sum[0, -last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
         R, t, contact = _parts(output[-count:])
         self._floor.follow(contact, forward_kinematics(self._skeleton, R, t).t[:, self._feet])
-        self.emit(self._pipeline.lookahead)
+        self.emit(self._pipeline.overlap.lookahead)
 
     def _estimated(self) -> Float[Tensor, "last value"]:
         """Root, 6D rotations and contact of the window's last frames, in the world."""
-        frames, mirrors = self.frames, self._pipeline.mirror_average
+        frames, mirrors = self.frames, self._pipeline.overlap.mirror_average
         assert frames is not None
         features, floor, size, sensed = (
             self._pipeline.model.features,
