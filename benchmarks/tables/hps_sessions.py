@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from benchmarks.rivals.hps_scores import RigCloud, nearest_frames, visit_times
-from benchmarks.tables.depth_rig import person_clouds, place_rig, registered, voxel_downsample
+from benchmarks.tables.depth_rig import Background, DepthView, person_cloud, voxel_downsample
+from benchmarks.tables.simulated_depth_rig import approximate, place_rig, simulate_rig
 from data_prep.simulated import source_files
 from wearcap.body.anny_body import anny_body
 from wearcap.files import content_hash, write_text
@@ -29,6 +30,8 @@ from wearsim.rendering.head_camera import SOUND_HZ, sound_track
 from wearsim.rendering.scan import scan_world
 from wearsim.rendering.views import Scenery
 
+RIG_SCENE_M = 8.0
+"""Of the scan around the spot, the rig is registered to."""
 CLOUD_VOXEL_M = 0.01
 """The rig's clouds are thinned to: still twice as dense as the body's vertices."""
 RECORDING, SCAN, CLOUDS, ABOUT = "recording.safetensors", "scan.ply", "clouds.ply", "session.json"
@@ -83,7 +86,7 @@ def _make(settings: SessionSettings, seed: int, folder: Path) -> None:
     assert recording.motion is not None
     assert recording.intervals is not None
     times = visit_times(recording.intervals, settings.instants)
-    clouds, error_m = _rig_clouds(recording, world, times, seed)
+    clouds, error_m = _rig_clouds(recording, world, scan, times, seed)
     save_recording(recording, folder / RECORDING)
     write_ply(Ply(scan.points, scan.colors), folder / SCAN)
     write_ply(Ply(np.concatenate(clouds).astype(np.float32)), folder / CLOUDS)
@@ -94,7 +97,7 @@ def _make(settings: SessionSettings, seed: int, folder: Path) -> None:
 
 
 def _rig_clouds(
-    recording: Recording, world: World, times: torch.Tensor, seed: int
+    recording: Recording, world: World, scan: Scan, times: torch.Tensor, seed: int
 ) -> tuple[list[np.ndarray], list[float]]:
     """The person's clouds at all instants in order, and how far off each camera was registered (m)."""
     motion, rng = recording.motion, np.random.default_rng([32, seed])
@@ -106,10 +109,16 @@ def _rig_clouds(
     spot = np.array(world.places.spots[0].position)
     true = place_rig(world, spot)
     people = [Mesh(v, faces, np.ones(3, np.float32)) for v in vertices]
-    believed = registered(true, rng)
-    clouds = person_clouds([world.mesh], people, true, believed, rng)
+    rig = simulate_rig([world.mesh], people, true, rng)
+    near = scan.points[np.linalg.norm(scan.points - spot, axis=1) < RIG_SCENE_M]
+    rough = approximate(true, rng)
+    views = [
+        DepthView(rig.camera, rough[number], Background.of(rig.empty_mm[number])).registered(near)[0]
+        for number in range(len(true.t))
+    ]
+    clouds = [person_cloud(list(rig.depth_mm[:, number]), views) for number in range(len(frames))]
     thinned = [voxel_downsample(torch.from_numpy(cloud), CLOUD_VOXEL_M)[0].numpy() for cloud in clouds]
-    return thinned, [float(off) for off in (believed.t - true.t).norm(dim=-1)]
+    return thinned, [float((view.T_world_cam.t - t).norm()) for view, t in zip(views, true.t)]
 
 
 @dataclass(frozen=True)

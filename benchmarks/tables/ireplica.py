@@ -1,4 +1,4 @@
-"""iReplica on simulated recordings of held-out people and objects: Tables 5.1 to 5.3 and 5.5 of the paper.
+"""iReplica on simulated recordings of held-out people and objects: Tables 5.1 to 5.5 of the paper, and robustness.
 
 HPS with noisy localisation registers the wearer; every row below captures the same motion. Recordings of the split are
 dealt out to `--seeds` groups: means are over groups, ± their deviation. Without checkpoints, the networks are those in
@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.tables import result_pages as pages
-from benchmarks.tables.ireplica_runs import Networks, RecordingRun, run_recording
+from benchmarks.tables.ireplica_runs import DISTURBANCES, GAPS_S, Networks, RecordingRun, run_recording
 from benchmarks.tables.tabling import cell, new_table, summarize, write_tree
 from wearcap.errors import WearcapError
 from wearcap.metrics.detection import mean_detection_scores
@@ -47,6 +47,8 @@ PAPER_DETECTION = {
     "the paper's VISOR": (0.217, 0.313, 0.098, 0.732),
 }
 """Thesis Table 5.3: AP, precision, recall, accuracy at 0.5."""
+PAPER_GAPS = (13.61, 8.49, 7.13, 8.86, 8.86)
+"""Thesis Table 5.4 (cm)."""
 PAPER_CHAMFER = {"HPS": (9.771, 22.651), "as published": (8.981, 8.471)}
 """Thesis Table 5.5: body and object (cm)."""
 KINDS = {
@@ -81,6 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="checkpoints of the published networks, one per class",
     )
     parser.add_argument("--rows", nargs="+", default=[], metavar="ROW", help="these rows alone, 'ours' among them")
+    parser.add_argument("--no-robustness", action="store_true", help="leave out the runs with worse sensors")
     parser.add_argument("--jobs", type=int, default=2, help="recordings at a time")
 
 
@@ -98,8 +101,17 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     seeds = min(2 if options.quick else options.seeds, len(names))
     names = names[:seeds] if options.quick else names
     networks = Networks(tuple(options.ours), tuple(options.published))
-    rows = tuple(dict.fromkeys(["ours", *options.rows])) if options.rows else ()
-    runs = [RecordingRun(options.dataset, name, networks, rows) for name in names]
+    # worse sensors once per group: HPS is run again for each
+    runs = [
+        RecordingRun(
+            options.dataset,
+            name,
+            networks,
+            index < seeds and not (options.no_robustness or options.quick),
+            tuple(dict.fromkeys(["ours", *options.rows])) if options.rows else (),
+        )
+        for index, name in enumerate(names)
+    ]
     found = Parallel(n_jobs=options.jobs)(delayed(_run_printed)(run) for run in runs)
     groups: list[list[Any]] = [list(found[k::seeds]) for k in range(seeds)]
     tree = {"about": about | {"dataset": str(options.dataset), "split": options.split, "recordings": names}} | _tree(
@@ -141,6 +153,8 @@ def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
     tree = trees["ireplica"]
     rows, about = tree["rows"], tree["about"]
     groups = rows["ours"]["all"]["end_cm"]["seeds"]
+    shown = [_ends(tree), _hands(tree), _detections(tree), _gaps(tree), _chamfer(tree)]
+    shown += [_robustness(tree)] if tree["robustness"] else []
     spread = f"{groups} groups of {len(about['recordings'])} recordings"
     theirs, both = (pages.mean(rows[name]["all"]["end_cm"]) for name in ("as published", "as published, our contacts"))
     factor = pages.figures_of(speed, "ireplica_realtime_factor")
@@ -169,7 +183,7 @@ def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
         "[simulation](simulation.md). Camera and suit share one clock, but in rows that say so. Contacts of a detector are those of a "
         "simulated one, which errs as often as Hand Object Detector does by its own record: no picture was looked at. Every row captures the same motion.",
         limits=_limits(tree),
-        full=[pages.grid_of(table, about, spread) for table in _shown(tree)]
+        full=[pages.grid_of(table, about, spread) for table in shown]
         + [
             pages.grid_of(each, other["about"], spread)
             for name, other in beside.items()
@@ -200,6 +214,7 @@ def _from_ideal_to_poor(beside: pages.Trees) -> str:
 def _beside(name: str, tree: pages.Tree) -> list[Table]:
     """The tables of a data set with one preset's sensors; the rows of typical ones are the page's other tables."""
     shown = [] if name == "typical" else [_ends(tree), _hands(tree)]
+    shown += [_robustness(tree)] if tree["robustness"] else []
     for table in shown:
         table.title = f"{name} sensors, {table.title}"
     return shown
@@ -257,12 +272,22 @@ def _tree(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
     rows, detectors = (
         [name for name in runs[0][part] if all(name in run[part] for run in runs)] for part in ("rows", "detection")
     )
+    gaps = {str(gap): [[run["gaps"][str(gap)] for run in group] for group in groups] for gap in GAPS_S}
+    disturbed = [[run["robustness"] for run in group if "robustness" in run] for group in groups]
     return {
         "handlings": sum(len(run["rows"]["ours"]["handlings"]) for group in groups for run in group),
         "rows": {row: _row([[run["rows"][row] for run in group] for group in groups]) for row in rows},
+        "gaps": {gap: _measure(parts, "end_cm", None) for gap, parts in gaps.items()},
         "detection": {
             name: _detection([[run["detection"][name] for run in group] for group in groups]) for name in detectors
         },
+        "robustness": {
+            name: _row([[run[name] for run in group] for group in disturbed])
+            | _detection([[run[name]["detection"] for run in group] for group in disturbed])
+            for name in DISTURBANCES
+        }
+        if any(disturbed)
+        else {},
     }
 
 
@@ -325,13 +350,10 @@ def _show(tree: dict[str, Any]) -> None:
     console = Console()
     if not console.is_terminal or console.width < WIDTH:
         console = Console(width=WIDTH)
-    for part in _shown(tree):
+    parts = (_ends(tree), _hands(tree), _detections(tree), _gaps(tree), _chamfer(tree))
+    for part in (*parts, *([_robustness(tree)] if tree["robustness"] else [])):
         console.print(part)
     console.print(f"{tree['handlings']} handlings in {len(tree['about']['recordings'])} recordings")
-
-
-def _shown(tree: dict[str, Any]) -> list[Table]:
-    return [_ends(tree), _hands(tree), _detections(tree), _chamfer(tree)]
 
 
 def _ends(tree: dict[str, Any]) -> Table:
@@ -383,6 +405,13 @@ def _detections(tree: dict[str, Any]) -> Table:
     return shown
 
 
+def _gaps(tree: dict[str, Any]) -> Table:
+    shown = new_table("Table 5.4: gaps filled (s) and where objects end (cm)", ["", *tree["gaps"]])
+    shown.add_row("ours", *(cell(found, 1) for found in tree["gaps"].values()))
+    shown.add_row("the paper's", *(f"{value:.2f}" for value in PAPER_GAPS))
+    return shown
+
+
 def _chamfer(tree: dict[str, Any]) -> Table:
     shown = new_table(
         "Table 5.5: Chamfer to the true surfaces during interactions (cm); in brackets the paper's, to depth cameras' clouds",
@@ -392,4 +421,19 @@ def _chamfer(tree: dict[str, Any]) -> Table:
         cells = [cell(found["whole"][name], 1) for name in ("body_chamfer_cm", "object_chamfer_cm")]
         beside = [f"  [{value:.1f}]" for value in PAPER_CHAMFER.get(row, ())] or ["", ""]
         shown.add_row(row, *(value + known for value, known in zip(cells, beside)))
+    return shown
+
+
+def _robustness(tree: dict[str, Any]) -> Table:
+    shown = new_table(
+        "Worse sensors: ours, one recording per group", ["", "AP", "end cm / degrees", "hand cm", "object cm"]
+    )
+    for name, found in tree["robustness"].items():
+        shown.add_row(
+            name,
+            cell(found["detection"]["average_precision"], 3),
+            _two(found["all"], spread=True),
+            cell(found["all"]["hand_cm"], 1),
+            cell(found["all"]["object_cm"], 1),
+        )
     return shown

@@ -1,19 +1,30 @@
-"""Errors of simulated sensors against what papers and vendors say."""
+"""How far simulated people and sensors differ from real ones: gait statistics of straight walking against CMU, knees, hips
+and ankles over the gait cycle against those of healthy adults, and sensors' errors against what papers and vendors say.
+"""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import torch
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import ks_2samp
 
+from benchmarks.tables.gait_statistics import Clip, clip_of, curve_deviations, walking_windows
 from benchmarks.tables.result_pages import Grid, Page, Tree, Trees, commands, grid_of, text
 from benchmarks.tables.simulated_sensors import Sensing, sensors
 from benchmarks.tables.tabling import write_tree
+from wearcap.recording import Recording, RecordingStore
 from wearsim.recordings.hps import HpsConfig, Protocol
+
+WIDTH = 220
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=list(PARTS), help="tables to make")
+    parser.add_argument("--simulated", default="datasets/simulated", help="prepared data set of simulated people")
+    parser.add_argument("--cmu", default="datasets/cmu", help="prepared data set of CMU")
     parser.add_argument(
         "--sessions", type=int, default=3, help="walks in which sensors are drawn (1 short one when quick)"
     )
@@ -24,14 +35,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
-    """Print and write the table; returns the path of the JSON file."""
+    """Print and write the tables; returns the path of the JSON file."""
+    found = {part: PARTS[part](options) for part in options.parts}
+    console = Console(width=WIDTH)
+    for table in _shown(found):
+        console.print(table)
+    return write_tree(options.output / "simulation.json", {"about": about, "tables": found})
+
+
+def _shown(found: Tree) -> list[Table]:
+    made = {"walking": _statistics_table, "curves": _curves_table, "sensors": _sensors_table}
+    return [made[part](tree) for part, tree in found.items()]
+
+
+def _walking(options: argparse.Namespace) -> Tree:
+    simulated, cmu = (walking_windows(_clips(root, options.quick)) for root in (options.simulated, options.cmu))
+    return _compared(simulated, cmu)
+
+
+def _curves(options: argparse.Namespace) -> Tree:
+    stores = {"simulated": options.simulated, "CMU": options.cmu}
+    return {
+        name: curve_deviations(recording.motion for recording in _recordings(root, options.quick) if recording.motion)
+        for name, root in stores.items()
+    }
+
+
+def _sensors(options: argparse.Namespace) -> Tree:
     protocol = Protocol(returns_m=(30.0,), end_m=40.0) if options.quick else Protocol()
     sessions, draws = (1, 4) if options.quick else (options.sessions, options.draws)
-    found = sensors(Sensing(HpsConfig(protocol=protocol), sessions, draws, options.interactions))
-    Console(width=220).print(_sensors_table(found))
-    return write_tree(options.output / "simulation.json", {"about": about, "tables": {"sensors": found}})
+    return sensors(Sensing(HpsConfig(protocol=protocol), sessions, draws, options.interactions))
 
 
+PARTS = {"sensors": _sensors, "walking": _walking, "curves": _curves}
 LITERATURE = Path(__file__).with_name("sensor_literature.tsv")
 """Quantity, label with unit, digits, what is published, and where; "ours" is an assumption."""
 KEY = (
@@ -98,7 +134,70 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "widely.",
             "Nothing here says that errors are correlated with each other as in a real device.",
         ),
-        full=[grid_of(_sensors_table(measured), tree.get("origins", {}).get("sensors", tree["about"]))],
+        full=[
+            grid_of(table, tree.get("origins", {}).get(part, tree["about"]))
+            for part in tree["tables"]
+            for table in _shown({part: tree["tables"][part]})
+        ],
         commands=commands(trees),
         measured="",
     )
+
+
+def _recordings(root: str, quick: bool) -> Iterator[Recording]:
+    store = RecordingStore.open(root)
+    names = [name for name in store.names() if store.entries[name].duration_s >= 2]
+    names = names[:: max(1, len(names) // 60)] if quick else names
+    return (store.load(name) for name in names)
+
+
+def _clips(root: str, quick: bool) -> list[Clip]:
+    return [clip_of(recording) for recording in _recordings(root, quick)]
+
+
+def _compared(simulated: dict[str, torch.Tensor], cmu: dict[str, torch.Tensor]) -> dict[str, dict[str, float]]:
+    """Mean and spread of every statistic on both sides, and the Kolmogorov–Smirnov distance between them."""
+    rows = {}
+    for name in cmu:
+        a, b = simulated[name], cmu[name]
+        if min(len(a), len(b)) < 2:
+            continue
+        rows[name] = {
+            "simulated_mean": a.mean().item(),
+            "simulated_std": a.std().item(),
+            "simulated_windows": len(a),
+            "cmu_mean": b.mean().item(),
+            "cmu_std": b.std().item(),
+            "cmu_windows": len(b),
+            "ks_distance": float(ks_2samp(a.numpy(), b.numpy())[0]),
+        }
+    return rows
+
+
+def _statistics_table(statistics: dict[str, dict[str, float]]) -> Table:
+    first = next(iter(statistics.values()), {"simulated_windows": 0, "cmu_windows": 0})
+    table = Table(title="Straight walking, windows of 2 s")
+    for name in (
+        "statistic",
+        f"simulated ({first['simulated_windows']})",
+        f"CMU ({first['cmu_windows']})",
+        "Kolmogorov–Smirnov",
+    ):
+        table.add_column(name, justify="left" if name == "statistic" else "right")
+    for name, row in statistics.items():
+        sides = [f"{row[side + '_mean']:.2f} ± {row[side + '_std']:.2f}" for side in ("simulated", "cmu")]
+        table.add_row(name, *sides, f"{row['ks_distance']:.2f}")
+    return table
+
+
+def _curves_table(curves: dict[str, dict[str, dict[str, float]]]) -> Table:
+    table = Table(
+        title="Mean curves of level walking off those of healthy adults, rms in degrees: median of recordings"
+    )
+    columns = ("recordings", "knee_rms_deg", "worst_knee_deg", "hip_rms_deg", "ankle_rms_deg")
+    for name in ("", "recordings", "knee", "knee, worst", "hip", "ankle"):
+        table.add_column(name, justify="right" if name else "left")
+    for whose, rows in curves.items():
+        for speeds, row in rows.items():
+            table.add_row(f"{whose}, {speeds}", *(f"{row[name]:.{int(name != 'recordings')}f}" for name in columns))
+    return table

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,11 +11,16 @@ import torch
 from benchmarks.rivals import compose
 from benchmarks.speed import latent_optimisation_vs_best_adam as clocks
 from benchmarks.tables import echo as tables_echo
+from benchmarks.tables import gait_statistics as gait
 from benchmarks.tables import hmd2 as tables_hmd2
 from benchmarks.tables import mocap_every as tables
 from benchmarks.tables import tabling
 from benchmarks.tables.hmd2_runs import Result, best_of
 from benchmarks.tables.sensed import GIVEN, WRONG_HEIGHTS, SensedStore, sensed
+from normal_walk import walk
+from wearcap.geometry.rotation import about_axis
+from wearcap.metrics.gait import normal_knee_deg
+from wearcap.recording import Motion
 
 
 def test_a_row_prints_what_its_training_took(tmp_path, trusted):
@@ -222,3 +228,76 @@ def test_learned_rivals_of_echo_see_as_many_frames_as_ours():
 
 def test_learned_rivals_of_mocap_every_see_as_many_frames_as_ours():
     assert len({frames_of(tables.training(run))[1] for run in tables.RUNS}) == 1
+
+
+def test_dominant_frequency_finds_a_planted_one():
+    t = torch.arange(gait.WINDOW) / gait.FPS
+    waves = torch.stack([3 + torch.sin(2 * math.pi * f * t + f) for f in (0.7, 0.95, 1.2)])
+    assert gait.dominant_frequency(waves).tolist() == pytest.approx([0.7, 0.95, 1.2], abs=0.015)
+    assert gait.peak_to_peak(waves[:1] + 5 * t).item() == pytest.approx(2.0, abs=0.3)
+
+
+def walker(speed: float, person: str, seconds: int = 6, bob: float = 0.03, swing: float = 0.2):
+    """A clip of someone whose pelvis bobs and whose legs swing in antiphase."""
+    t = torch.arange(seconds * gait.FPS) / gait.FPS
+    phase = 2 * math.pi * 0.9 * t
+    pelvis = torch.stack([speed * t, 0.02 * phase.sin(), 0.95 + bob / 2 * (2 * phase).cos()], -1)
+    joints = {}
+    for name in gait.JOINTS:
+        side = {"left": 1.0, "right": -1.0}.get(name.split("_")[0], 0.0)
+        drop = {"head": -0.6, "knee": 0.45, "ankle": 0.9, "toe": 0.95, "shoulder": -0.45, "wrist": 0.1}
+        down = drop.get(name.split("_")[-1], 0.0)
+        offset = torch.stack([side * swing * max(down, 0.0) * phase.sin(), 0 * t + 0.1 * side, 0 * t - down], -1)
+        joints[name] = pelvis + offset
+    return gait.Clip(person, joints, torch.eye(3).expand(len(t), 3, 3), torch.zeros(len(t)), 1.55)
+
+
+def test_gait_statistics_of_a_planted_walk():
+    found = gait.statistics(walker(1.25, "a"))
+    assert len(found["speed_m_s"]) == 5
+    assert found["speed_m_s"].mean().item() == pytest.approx(1.25, abs=0.01)
+    assert found["cadence_steps_min"].mean().item() == pytest.approx(108, abs=2)
+    assert found["pelvis_vertical_cm"].mean().item() == pytest.approx(3.0, abs=0.15)
+    assert found["pelvis_lateral_cm"].mean().item() == pytest.approx(4.0, abs=0.4)
+    assert found["head_height_share"].mean().item() == pytest.approx(1.0, abs=0.01)
+    assert not gait.is_walking(walker(0.2, "b")).any()
+    assert not gait.is_walking(walker(1.2, "b", bob=0.2)).any()
+
+
+def bent_walk(hip_deg: float, ankle_deg: float, speed: float) -> Motion:
+    """A walk with normal knees whose thighs are flexed and whose feet are drawn up by constant angles."""
+    motion = walk(speed=speed)
+    R = motion.R_parent_joint.clone()
+    for side in ("left", "right"):
+        R[:, motion.skeleton.index(f"{side}_hip")] = about_axis("y", -torch.tensor(math.radians(hip_deg)))
+        R[:, motion.skeleton.index(f"{side}_ankle")] = about_axis("y", -torch.tensor(math.radians(ankle_deg)))
+    return replace(motion, R_parent_joint=R)
+
+
+def test_curves_of_walking_are_those_of_the_joints():
+    curves = gait.walking_curves(bent_walk(12.0, 7.0, 1.1))
+    assert len(curves["knee"]) == len(curves["speed"]) > 8
+    assert curves["speed"].numpy() == pytest.approx(1.1, abs=1e-3)
+    assert (curves["knee"] - normal_knee_deg()).abs().max() < 1.5
+    assert curves["hip"].numpy() == pytest.approx(12.0, abs=0.01)
+    assert curves["ankle"].numpy() == pytest.approx(7.0, abs=0.01)
+
+
+def test_curves_are_compared_with_healthy_adults_by_speed():
+    rows = gait.curve_deviations([bent_walk(0.0, 0.0, 1.1), bent_walk(0.0, 0.0, 1.3), bent_walk(6.0, 0.0, 1.35)])
+    assert {name: row["recordings"] for name, row in rows.items()} == {"0.95 to 1.2 m/s": 1, "1.2 to 1.45 m/s": 2}
+    slow = rows["0.95 to 1.2 m/s"]
+    hip = gait.normal_curves()["hip"]
+    assert hip.amin() == pytest.approx(-20, abs=1)
+    assert hip.amax() == pytest.approx(25, abs=1)
+    assert slow["hip_rms_deg"] == pytest.approx(hip.square().mean().sqrt().item(), abs=0.05)
+    assert slow["knee_rms_deg"] == pytest.approx(slow["worst_knee_deg"], abs=1e-9)
+    assert slow["knee_rms_deg"] < 1.0
+
+
+def test_cycles_with_a_flight_are_no_walk():
+    motion = bent_walk(0.0, 0.0, 1.1)
+    contact = torch.ones(len(motion), 4)
+    assert len(gait.walking_curves(replace(motion, contact_prob=contact))["knee"]) > 8
+    contact[::5] = 0.0
+    assert len(gait.walking_curves(replace(motion, contact_prob=contact))["knee"]) == 0
