@@ -51,6 +51,7 @@ def few_statistics():
     """Training takes its normalisation from 100 windows in place of up to 1500, which would take most of a short run."""
     from benchmarks.rivals.pose_regression.training import PoseRegression
     from wearcap.systems.echo.training import EchoDiffusion
+    from wearcap.systems.hmd2.training import MotionDiffusion
     from wearcap.systems.hmd2.voxel_autoencoder_training import VoxelReconstruction
     from wearcap.systems.ireplica.training import ContactDetection
     from wearcap.systems.mocap_every.manifold_training import ManifoldTraining
@@ -61,6 +62,7 @@ def few_statistics():
         ContactDetection,
         EchoDiffusion,
         ManifoldTraining,
+        MotionDiffusion,
         MotionEncoding,
         PoseRegression,
         VoxelReconstruction,

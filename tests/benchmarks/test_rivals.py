@@ -21,8 +21,9 @@ from wearcap.models.build import brought_up_to_date, target_of
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap_testing import small_dataset
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
 NAME, STEP = "motion_diffusion_head", 8 * 240
-SMALL = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
+SMALL = [f"model.net.transformer.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
 QUIET = [
     "data.dataset.window=60",
     "data.loading.val_windows=8",

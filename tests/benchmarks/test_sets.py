@@ -14,8 +14,9 @@ from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import RecordingStore
 from wearcap_testing import recording_of, small_dataset
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
 SMALL = [
-    *(f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")),
+    *(f"model.net.transformer.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")),
     *("data.dataset.window=60", "data.loading.val_windows=8", "data.loading.batch_size=4", "trainer.accelerator=cpu"),
     *("trainer.enable_progress_bar=false", "callbacks.progress=null"),
 ]

@@ -394,7 +394,7 @@ def test_foreign_files_become_recordings_and_what_the_doctor_refuses_does_not(fo
     verb.main(["bvh", f"source={one}", f"output={foreign_folder / 'single'}", "jobs=1", "subject=ben"])
     store = RecordingStore.open(foreign_folder / "single")
     assert store.names() == ["ben-a"]
-    assert store.entries["ben-a"].subject == "ben"
+    assert store.entries["ben-a"].context.subject == "ben"
 
 
 @pytest.mark.real

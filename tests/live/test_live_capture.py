@@ -173,7 +173,7 @@ def test_a_wearer_who_leaves_and_comes_back_begins_anew(monkeypatch):
         for k, (packet, pause) in enumerate(script)
     ]
     report = LiveCapture(small_hmd2(), [Scripted(script)], [kept], known=Known(setup=setup)).run(30.0)
-    assert kept.left == [""]
+    assert kept.left == ["", ""], "when they left, and when the capture ended"
     assert report["wearers"]["wearer"]["frames"] == 2 * 120
     torch.testing.assert_close(kept.pieces[""][-1].timestamps[-1].item(), 5.0 + 119 / 60)
 

@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wearcap.cli.conf import compose
+from benchmarks.rivals import compose
 from wearcap.errors import WearcapError
 from wearcap.optimize.losses import Loss
 from wearcap.systems.ireplica.trajectory import Bending, bend, bend_adam, bending_problem, bent, energy_terms, wrapped
@@ -283,7 +283,10 @@ def _least(solved) -> float:
 
 @pytest.mark.parametrize("choice", ["adam", "banded"])
 def test_every_config_bends(choice):
-    config = compose("capture", ["recording=none", f"+bending={choice}"]).bending
+    if choice == "adam":
+        config = compose("capture", ["recording=none", "+bending=adam"]).bending
+    else:
+        config = compose("capture", ["recording=none", "pipeline=paper/bent_suit"]).pipeline.bend
     path, timestamps = stroll(60)
     imu = drifted(path)
     few = {"solver": functools.partial(bend_adam, iterations=20)} if choice == "adam" else {}

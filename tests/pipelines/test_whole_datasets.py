@@ -39,7 +39,7 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def checkpoint(data, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "run"
-    small = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
+    small = [f"model.net.transformer.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
     quiet = ["trainer.enable_progress_bar=false", "callbacks.progress=null", "callbacks.capture=null"]
     given = [f"data.sources.simulated.root={data}", f"hydra.run.dir={run}", "data.dataset.window=60", "debug=fast"]
     train.main(["experiment=motion_diffusion_head", "trainer.accelerator=cpu", *given, *small, *quiet])

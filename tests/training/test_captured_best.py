@@ -7,7 +7,7 @@ import torch
 from wearcap.cli import train
 from wearcap_testing import small_dataset
 
-SMALL = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
+SMALL = [f"model.net.transformer.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
 
 
 def test_the_best_checkpoint_is_that_of_the_least_captured_error(tmp_path):

@@ -23,6 +23,7 @@ from wearcap.training.loggers import read_metrics
 from wearcap.training.run import differing_keys, resume_path, run_to_continue
 from wearcap_testing import small_dataset
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
 SMALL = [
     "model.net.transformer.width=32",
     "model.net.transformer.layers=1",

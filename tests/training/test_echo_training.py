@@ -89,7 +89,7 @@ class Oracle(EchoDenoiser):
 
 
 def oracle(frame: str = "own", **changes) -> EchoDiffusion:
-    net = partial(Oracle, window=WINDOW, width=32, layers=1, heads=2, feedforward=32)
+    net = partial(Oracle, window=WINDOW, transformer=TransformerSize(32, 1, 2, 32, 0.0))
     return learner(net, features=small_features(frame, **changes))
 
 

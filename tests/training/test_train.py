@@ -17,6 +17,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained, read_checkpoint
 from wearcap_testing import experiments, small_dataset
 
+pytestmark = pytest.mark.usefixtures("few_statistics")
 EXPERIMENTS = experiments("motion_diffusion")
 KINDS = ("motion_", "contact_", "egoview", "voxel_autoencoder", "hmd2", "mocap_every", "object_encoder", "echo")
 SMALL = [

@@ -15,7 +15,6 @@ from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.landmarks import TPose, t_pose
 from wearcap.body.skeleton import SIDES, Site, Skeleton
 from wearcap.geometry.rotation import swing_between
-from wearcap.geometry.trajectory import interpolate_clamped
 
 
 def _arc_lengths(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
@@ -191,8 +190,11 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
     def chain(points: Tensor, joints: tuple[int, ...], end: int) -> None:
         """Place a chain's joints on a polyline, at the fractions of its length that they have in the target."""
         knots, arc = _arc_lengths(target.t[[*joints, end]]), _arc_lengths(points)
-        wanted = knots[:-1] / knots[-1].clamp_min(1e-9) * arc[-1]
-        places.update(zip(joints, interpolate_clamped(arc, points, wanted).unbind(0)))
+        wanted = (knots[:-1] / knots[-1].clamp_min(1e-9) * arc[-1]).contiguous()
+        after = torch.searchsorted(arc, wanted).clamp(1, len(points) - 1)
+        steps = (points[1:] - points[:-1]).norm(dim=-1)  # zero where joints coincide
+        weight = ((wanted - arc[after - 1]) / steps[after - 1].clamp_min(1e-9))[:, None]
+        places.update(zip(joints, (points[after - 1] * (1 - weight) + points[after] * weight).unbind(0)))
 
     *lower, top = to.spine
     if lower:

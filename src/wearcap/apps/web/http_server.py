@@ -20,6 +20,8 @@ from wearcap.apps.web.guard import Guard, Refused
 
 MAX_HEADER = 1 << 14
 """Bytes of a request before its body."""
+DRAIN, DRAIN_S = 1 << 20, 0.2
+"""Bytes, and time (s), that are read of a request that was refused."""
 _PHRASES = {status.value: status.phrase for status in HTTPStatus}
 
 
@@ -121,6 +123,11 @@ class Handler(BaseHTTPRequestHandler):
         self.close_connection = True
         data, kind = self.error(message or _PHRASES[code])
         self.send(data, kind, HTTPStatus(code))
+        self.connection.shutdown(socket.SHUT_WR)
+        self._arriving.until_s, self._arriving.left = time.monotonic() + DRAIN_S, DRAIN
+        with contextlib.suppress(http.client.LineTooLong, TimeoutError):
+            while self._buffered.read1():  # what is left unread would reset the connection before the answer came
+                pass
 
     def error(self, message: str) -> tuple[bytes, str]:
         """Body of an answer that says what is wrong, and its type."""

@@ -5,11 +5,9 @@
 
 import json
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import torch
 
@@ -22,6 +20,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.poses import are_rotations
 from wearcap.scene.scan import Photo
 
+_NUMBERS = ("fx", "fy", "cx", "cy")
 EXAMPLE = (
     '{"camera": {"model": "opencv", "width": …, "height": …, "fx": …, "fy": …, "cx": …, "cy": …, "distortion": […]}}'
 )
@@ -29,16 +28,22 @@ EXAMPLE = (
 
 def camera_row(camera: Camera) -> dict[str, Any]:
     """A camera as plain numbers."""
-    return asdict(camera) | {"distortion": list(camera.distortion)}
+    names = ("model", "width", "height", *_NUMBERS)
+    return {name: getattr(camera, name) for name in names} | {"distortion": list(camera.distortion)}
 
 
 def _camera_from_row(row: Any, where: str | Path) -> Camera:
     """Camera from the dict of `camera_row`. Raises WearcapError naming `where` when numbers are missing or invalid."""
     with understood("no intrinsics", where, EXAMPLE), placed(where):
-        camera = msgspec.convert(row, Camera, strict=False)
-        if not all(map(math.isfinite, (camera.cx, camera.cy, *row["distortion"]))):
+        if not all(math.isfinite(float(value)) for value in (row["cx"], row["cy"], *row["distortion"])):
             raise ValueError("numbers that are not finite")
-        return camera
+        return Camera(
+            str(row["model"]),
+            int(row["width"]),
+            int(row["height"]),
+            *(float(row[key]) for key in _NUMBERS),
+            tuple(map(float, row["distortion"])),
+        )
 
 
 def write_camera(camera: Camera, path: str | Path, calibration: dict[str, Any] | None = None) -> None:

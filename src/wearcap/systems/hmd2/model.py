@@ -79,9 +79,8 @@ class ConditionEncoder(nn.Module):
         mask = valid[..., None].to(conditions.head.dtype)
         frames = torch.cat([self.normalizer(conditions.head) * mask, mask], -1)
         wide = self.widen(frames)
-        for name, x, given in zip(
-            self.sizes, conditions.others.split([*self.sizes.values()], -1), conditions.given.unbind(-1)
-        ):
+        parts = conditions.others.split([*self.sizes.values()], -1) if self.sizes else ()
+        for name, x, given in zip(self.sizes, parts, conditions.given.unbind(-1)):
             wide = wide + self.get_submodule(name)(x, given & valid)
         return self.narrow(F.gelu(wide))
 

@@ -102,7 +102,7 @@ class MotionDiffusion(Training):
         parts = self.features, self.schedule, self.skeleton, self.fps, self.given
         return {"model": DiffusionModel(self.net, *parts)}
 
-    def set_statistics(self, dataset: Windows) -> None:
+    def set_statistics(self, dataset: Windows, limit: int = 2000) -> None:
         """Set normalisation from a training split. Raises WearcapError unless its windows have the model's inputs."""
         content, net = dataset.content, self.net
         assert isinstance(content, HeadContent)
@@ -118,7 +118,7 @@ class MotionDiffusion(Training):
                 condition.encoder.load_state_dict(made_by.state_dict())
             elif condition.encoder != made_by:
                 raise WearcapError(f"{name} of {made_by!r}", expected=condition.encoder)
-        statistics = feature_statistics(dataset, self.features, net.conditions)
+        statistics = feature_statistics(dataset, self.features, net.conditions, limit)
         net.motion_normalizer.set(*statistics["motion"])
         net.condition_encoder.normalizer.set(*statistics["head"])
         for name in net.conditions:
@@ -163,7 +163,7 @@ class MotionDiffusion(Training):
             terms["joints"] = losses.joint_position(predicted, true, weight)
             terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.fps)
             feet = predicted[:, :, self._feet]
-            feet = rearrange(feet, "batch time (foot point) axis -> batch time foot point axis", foot=FEET)
+            feet = rearrange(feet, "batch time (foot point) xyz -> batch time foot point xyz", foot=FEET)
             feet = feet + batch.t_world_head[:, :, None, None]
             terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
             if self.features.contacts:
@@ -175,11 +175,11 @@ class MotionDiffusion(Training):
 
 
 def feature_statistics(
-    dataset: Windows, features: HeadFeatures, sizes: Mapping[str, int]
+    dataset: Windows, features: HeadFeatures, sizes: Mapping[str, int], limit: int = 2000
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """(mean, scale) of "motion", "head" and the other conditions over at most 2000 windows drawn by dataset weights."""
+    """(mean, scale) of "motion", "head" and the other conditions over at most `limit` windows drawn by dataset weights."""
     sums: dict[str, list[Tensor]] = {}
-    for batch in drawn_batches(dataset, min(2000, 4 * len(dataset)), 64):
+    for batch in drawn_batches(dataset, min(limit, 4 * len(dataset)), 64):
         motion = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
         head = features.condition(batch.R_world_head, batch.t_world_head, batch.floor_height, batch.size, dataset.fps)
         given = batch.valid[..., None] & batch.given

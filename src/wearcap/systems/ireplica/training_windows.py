@@ -49,7 +49,7 @@ class PoseNoise:
         fixed = torch.randn(1, 3 * joints, generator=random)
         quick = torch.randn(frames, 3 * joints, generator=random)
         error = scale * (shares[0] * fixed + shares[1] * slow + shares[2] * quick)
-        return rearrange(error, "time (joint axis) -> time joint axis", axis=3)
+        return rearrange(error, "time (joint xyz) -> time joint xyz", xyz=3)
 
 
 @dataclass(frozen=True, eq=False)
