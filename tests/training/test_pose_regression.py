@@ -26,7 +26,7 @@ from wearcap_testing import small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
+SMALL = ("width=32", "layers=1", "heads=4", "feedforward=32")
 HANDS = ("head", "left_wrist", "right_wrist")
 
 
@@ -51,7 +51,7 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
         "trainer.log_every_n_steps=1",
         "trainer.enable_progress_bar=false",
         "callbacks.progress=null",
-        *SMALL,
+        *(f"model.net.{'transformer.' if experiment.endswith('_style') else ''}{size}" for size in SMALL),
         *more,
     ]
 

@@ -210,7 +210,7 @@ def test_prodigy_may_stand_in_a_checkpoint(data, tmp_path):
 
 def test_a_trained_estimator_is_evaluated_and_edits_by_cues(data, tmp_path):
     run, manifold = tmp_path / "run", tmp_path / "manifold"
-    train.main(arguments("mocap_every", data, run, *SMALL))
+    train.main(arguments("mocap_every", data, run, *TWO_STAGE))
     train.main(arguments("motion_manifold", data, manifold, "model.net.channels=8", "model.net.width=5"))
     found = tmp_path / "table.json"
     evaluate.main(

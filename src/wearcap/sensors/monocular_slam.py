@@ -261,5 +261,5 @@ def _upright(up: np.ndarray, scale: float, scale_std: float, gravity_std: float)
     """The least turn that puts z up, so that the heading stays the SLAM's, about its origin; deviations as a share and in
     rad."""
     R = swing_between(torch.from_numpy(up.copy()), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    deviations = {"scale_std": scale_std, "gravity_std_deg": math.degrees(gravity_std)}
+    deviations = {"scale_std": float(scale_std), "gravity_std_deg": math.degrees(gravity_std)}
     return SlamAlignment(float(scale), R, torch.zeros(3, dtype=torch.float64), **deviations)

@@ -80,8 +80,8 @@ class ConditionEncoder(nn.Module):
         frames = torch.cat([self.normalizer(conditions.head) * mask, mask], -1)
         wide = self.widen(frames)
         parts = conditions.others.split([*self.sizes.values()], -1) if self.sizes else ()
-        for name, x, given in zip(self.sizes, parts, conditions.given.unbind(-1)):
-            wide = wide + self.get_submodule(name)(x, given & valid)
+        for number, (name, x) in enumerate(zip(self.sizes, parts)):
+            wide = wide + self.get_submodule(name)(x, conditions.given[..., number] & valid)
         return self.narrow(F.gelu(wide))
 
 
