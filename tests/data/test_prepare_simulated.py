@@ -38,7 +38,7 @@ def test_a_small_set(tmp_path):
     store = prepare(tmp_path / "a", "jobs=1")
     assert [len(store.names(split)) for split in ("train", "val", "test")] == [2, 1, 1]
     for kind in ("subject", "location"):
-        people = [{getattr(store.entries[n], kind) for n in store.names(s)} for s in ("train", "val", "test")]
+        people = [{getattr(store.entries[n].context, kind) for n in store.names(s)} for s in ("train", "val", "test")]
         assert not people[0] & people[1]
         assert not people[0] & people[2]
         assert not people[1] & people[2]
