@@ -76,7 +76,7 @@ def test_a_data_set_s_recordings_are_found_as_before(tmp_path):
 
 
 def test_data_sets_register_their_kinds():
-    """Where this fails though the file is right, wearcap was installed before it said so: install it again."""
+    """Where this fails though the file is right, wearcap was installed before it named this reader: install it again."""
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     rows = [pkgutil.resolve_name(name) for name in project["entry-points"]["wearcap.readers"].values()]
     names = [kind.name for row in rows for kind in row]
