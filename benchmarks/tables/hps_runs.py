@@ -29,7 +29,7 @@ ROWS = {
 }
 """The papers' rows, as the authors' code computes them, and ours: names of pipeline configs, with overrides."""
 PRINTED = {"HPS as printed": ("paper/hps",)}
-"""The paper's own energy and solver, which take an hour a session."""
+"""The paper's own energy and solver, which take some ten minutes for three of recording."""
 DISTURBED = ("IMU + Cam (filtered)", "HPS", "ours")
 OUTAGES_S = (30.0, 60.0)
 TRUTH = "the truth itself"
