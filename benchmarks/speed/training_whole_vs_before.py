@@ -30,11 +30,7 @@ from benchmarks.speed.training_paths import (
 )
 
 GOAL = 1.5
-BEFORE: dict[str, str | None] = {
-    "trainer.precision": "32-true",
-    "model.compile": "false",
-    "optimizer.optimizer.fused": "false",
-}
+BEFORE = {"trainer.precision": "32-true", "model.compile": False, "optimizer.optimizer.fused": False}
 """Settings of trainings before, of those that there are."""
 PRECISE = {"echo": "bf16-mixed"}
 """Precision of experiments whose precision was another."""

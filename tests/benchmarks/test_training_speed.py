@@ -59,7 +59,7 @@ def test_a_window_before_is_a_part_of_its_recording(datasets):
     number, start, _ = windows.starts[-1].tolist()
     motion = store.load(windows.recordings[number][1]).motion
     assert motion is not None
-    item = windows[len(windows) - 1, 3]
+    item: Any = windows[len(windows) - 1, 3]
     count = int(item.valid.sum())
     assert count > 100
     assert torch.equal(item.R_parent_joint[:count], motion.R_parent_joint[start : start + count])
@@ -76,6 +76,9 @@ def test_settings_before_keep_the_rest_of_a_config(datasets):
     assert (
         as_before("mocap_every", config_of("mocap_every", datasets[0])).trainer.precision == BEFORE["trainer.precision"]
     )
+    head = config_of("motion_diffusion_head", datasets[0], "model.compile=true")
+    assert as_before("motion_diffusion_head", head).model.compile is False
+    assert head.model.compile is True
     assert old.optimizer.optimizer.lr == config.optimizer.optimizer.lr
 
 
