@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed.training_data_size FOLDER [--hours 40] [--clip-seconds 13] [--sources datasets/cmu] [--before]
 
-AMASS's size is 40 hours of clips of 13 s, Nymeria's `--hours 300 --clip-seconds 900`, at 30 frames a second: 0.12 GB an
+AMASS's size is 40 hours of clips of 13 s, Nymeria's `--hours 300 --clip-seconds 900`, at 30 frames a second: 0.1 GB an
 hour. A set that the folder has is used again. Each figure is of a process of its own, which trains mocap_every_mlp:
 `…_prepare`: seconds until the first batch where nothing is cached; `…_start`: the same at the next start; `…_memory`: MB of
 its resident memory that the data takes after `seconds` of drawing; `…_windows`: windows per second of one thread. Baselines

@@ -27,7 +27,7 @@ def losses(experiment: str, datasets: Path, steps: int, seeds: int, *overrides: 
     for seed in range(seeds):
         given = f"trainer.max_steps={steps}", f"seed={seed}", f"data.loading.steps_per_epoch={steps}"
         config = config_of(experiment, datasets, *given, *overrides)
-        sides = dict(zip(("now", "before"), both(config)))
+        sides = dict(zip(("now", "before"), both(config)[:2]))
         state = first_weights(config, sides["now"])
         for name, data in sides.items():
             clock = trained(config, data, state).clock

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from benchmarks.rivals.single_windows.compose import data_before, training_config
+from benchmarks.speed.figures import seconds
 from benchmarks.speed.training_sets import generated, sources_of, write_set
 from wearcap.training.base import Training
 from wearcap.training.run import affordable_precision, keep_freed_memory
@@ -178,10 +179,11 @@ def fixed(batches: Sequence[Any]) -> DataLoader:
     return DataLoader(batches, batch_size=None)  # pyright: ignore[reportArgumentType]
 
 
-def both(config: DictConfig) -> tuple[Any, Any]:
-    """A config's data drawn in batches and drawn window by window, validated on the same windows."""
+def both(config: DictConfig) -> tuple[Any, Any, list[float]]:
+    """A config's data drawn in batches and drawn one by one, validated on the same windows; and seconds to open each."""
     now, before = data_now(config), data_before(config)
+    opened = [seconds(lambda data=data: data.dataset("train")) for data in (now, before)]
     before.setup("fit")
     validation = fixed([*before.val_dataloader()])
     now.val_dataloader = before.val_dataloader = lambda: validation
-    return now, before
+    return now, before, opened

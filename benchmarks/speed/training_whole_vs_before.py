@@ -4,7 +4,8 @@ Both begin with the same weights and statistics, train for the same number of st
 on the same windows. Before: one by one, in the training's own process, with `BEFORE`'s settings. `…_EXPERIMENT`: seconds of
 training, without validations, until the validation loss that the training before has at its end; ratio = baseline / value,
 to be at least `goal`, and no more than a bound where the unit names it. `…_step`, `…_drawing`, `…_together`: milliseconds of
-a step on a batch that is there, of drawing one, of a step of the training. `…_waiting`: share of the training's time that
+a step on a batch that is there, of drawing one, of a step of the training. `…_opening`: seconds until the data set is there,
+not part of the above; one by one, recordings are opened as they are drawn. `…_waiting`: share of the training's time that
 waits for batches.
 """
 
@@ -59,7 +60,7 @@ def measure(
 
 def compared(experiment: str, config: DictConfig, fixed: int) -> list[dict]:
     """The figures of one experiment."""
-    now, before = both(config)
+    now, before, opened = both(config)
     old = as_before(experiment, config)
     state = first_weights(config, now)
     parts = [_parts(*each, state, fixed) for each in ((config, now), (old, before))]
@@ -77,6 +78,7 @@ def compared(experiment: str, config: DictConfig, fixed: int) -> list[dict]:
         "together": (1000 * ours.each_s, 1000 * theirs.each_s),
     }.items():
         figures.append(figure(f"{name}_{part}", new, "ms", old_ms, old_ms / new, None))
+    figures.append(figure(f"{name}_opening", opened[0], "s", opened[1], opened[1] / opened[0], None))
     waits = ours.waiting, theirs.waiting
     figures.append(figure(f"{name}_waiting", waits[0], "of the time", waits[1], waits[0] / max(waits[1], 1e-9), None))
     return figures
