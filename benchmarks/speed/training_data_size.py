@@ -81,14 +81,13 @@ def _config(folder: str) -> DictConfig:
 
 
 def _alone(run: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a function in a process of its own."""
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+    """The result of a function in a process of its own, with one thread."""
+    with ProcessPoolExecutor(1, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
         return pool.submit(run, *arguments).result()
 
 
 def started(folder: str, before: bool, seconds: float) -> Start:
     """Draw windows for some seconds, in batches or one by one."""
-    torch.set_num_threads(1)
     config = _config(folder)
     free, begin = _resident_mb(), time.perf_counter()
     made: Any = data_before(config) if before else data_now(config)
@@ -112,11 +111,11 @@ def halves(folder: str, batches: int = 4) -> float:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(2, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
         parts = [pool.submit(half, folder, address, rank, batches) for rank in range(2)]
         both, again = (part.result() for part in parts)
     assert both == again
-    whole = _alone(drawn, folder, 0, 1, batches)
+    whole = drawn(folder, 0, 1, batches)
     steps = ((sorted(a + b), sorted(one)) for a, b, one in zip(*both, whole))
     alike = sum(len(set(one) & set(two)) for two, one in steps if len(set(two)) == len(two))
     return alike / sum(map(len, whole))
@@ -133,13 +132,11 @@ def half(folder: str, address: str, rank: int, batches: int) -> list[list[list[s
 
 def drawn(folder: str, rank: int, world: int, batches: int) -> list[list[str]]:
     """The windows of a process's first batches, each by what its tensors hold."""
-    torch.set_num_threads(1)
     config = _config(folder)
     config.data.loading.batch_size = 32 // world
     data = data_now(config)
-    data.trainer = SimpleNamespace(
-        global_rank=rank, world_size=world, strategy=SimpleNamespace(root_device=torch.device("cpu"))
-    )
+    place = {"global_rank": rank, "world_size": world, "current_epoch": 0, "overfit_batches": 0}
+    data.trainer = SimpleNamespace(**place, strategy=SimpleNamespace(root_device=torch.device("cpu")))
     data.setup("fit")
     made = (batch for _, batch in zip(range(batches), data.train_dataloader()))
     return [[sha256(row.numpy().tobytes()).hexdigest() for row in batch.R_world_wrist] for batch in made]

@@ -39,7 +39,6 @@ SMALLEST: dict[str, dict] = {
     "mocap_every_offline_fps": {"duration_s": 4.0, "repeats": 1},
     "mocap_every_online_fps": {"duration_s": 2.8, "repeats": 1},
     "splat_mpoints_per_second": {"view": 2000, "whole": 4000, "turns": 1},
-    "training_data_size": {"hours": 0.01, "clip_seconds": 6.0, "before": False, "seconds": 0.1},
     "training_whole_vs_before": {
         "datasets": None,
         "experiments": ("motion_diffusion_head",),
@@ -70,6 +69,7 @@ LARGE = {
     "ireplica_realtime_factor": "a prepared data set",
     "localization_frames_per_second": "a map of 504 pictures",
     "one_frame_contact": "simulated households, two minutes each",
+    "training_data_size": "generated data sets, in processes of their own (tests/benchmarks/test_training_speed.py)",
 }
 """Benchmarks that are not, and what they need."""
 

@@ -11,6 +11,7 @@ from benchmarks.rivals.single_windows import windows as frozen
 from benchmarks.rivals.single_windows.compose import compose_old, data_before, training_config
 from benchmarks.rivals.single_windows.datamodule import WindowsModule
 from benchmarks.rivals.window_loaders import Archive, ClipsInMemory, FilePerItem, encoded_clips, loader, raw_clips
+from benchmarks.speed import training_data_size as size
 from benchmarks.speed import training_losses
 from benchmarks.speed.training_paths import EXPERIMENTS, Clock, Trained, config_of, samples, small_sets
 from benchmarks.speed.training_sets import generated, sources_of, varied, write_set
@@ -151,3 +152,16 @@ def test_losses_of_equal_trainings_are_equal_and_others_stand_apart(datasets, ca
     assert row["experiment"] == "motion_diffusion_head"
     assert len(row["now"]["mean"]) == len(row["before"]["spread"]) == 1
     assert row["now"]["mean"] == pytest.approx(row["before"]["mean"], rel=0.3)
+
+
+def test_ranks_draw_halves_of_one_sequence_of_a_generated_set(tmp_path):
+    write_set(tmp_path / "cmu", generated(sources_of(None), 40 / 3600, 6.0, size.FPS))
+    found = size.started(str(tmp_path), False, 0.1)
+    assert found.windows_per_second > 0
+    assert found.seconds > 0
+    one, other = (size.drawn(str(tmp_path), rank, 2, 3) for rank in range(2))
+    whole = size.drawn(str(tmp_path), 0, 1, 3)
+    assert len(whole[0]) == 32
+    for a, b, both in zip(one, other, whole):
+        assert sorted(a + b) == sorted(both)
+        assert len({*a, *b}) == 32

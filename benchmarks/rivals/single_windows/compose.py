@@ -25,6 +25,9 @@ MOVED = {
 }
 """Where the classes of a config are in this package, by module or name."""
 
+OTHERS = 0.875
+"""Share of windows in which somebody else does the motion, where a config does not give it."""
+
 
 def compose_old(experiment: str, overrides: list[str] | tuple[str, ...] = ()) -> tuple[WindowsModule, Training]:
     """Data and module of an experiment of `conf/`; the data is drawn window by window, the module is today's."""
@@ -45,7 +48,7 @@ def data_before(config: DictConfig) -> WindowsModule:
 
 
 def _as_before(part: Any) -> Any:
-    """A part of a config with the classes of this package, and of its settings those that they have."""
+    """A part of a config with the classes of this package, and their settings."""
     if isinstance(part, list):
         return [_as_before(each) for each in part]
     if not isinstance(part, dict):
@@ -55,7 +58,18 @@ def _as_before(part: Any) -> Any:
     found = next((there for there in MOVED if target == there or target.startswith(f"{there}.")), None)
     if found is not None:
         part["_target_"] = f"{__package__}.{MOVED[found]}{target.removeprefix(found)}"
-    if target.endswith(".Loading"):
-        known = {"_target_", *(field.name for field in fields(Loading))}
-        part = {name: value for name, value in part.items() if name in known}
+        part = _settings_before(part, target.rpartition(".")[2])
+    return part
+
+
+def _settings_before(part: dict[str, Any], name: str) -> dict[str, Any]:
+    """A class's settings as they were before."""
+    if name == "Loading":
+        return {key: part[key] for key in ("_target_", *(field.name for field in fields(Loading))) if key in part}
+    if name == "OtherBodies" and "count" not in part:
+        share = part.pop("share", OTHERS)
+        return part | {"count": round(share / (1 - share))}
+    if name == "Windows" and part["content"]["_target_"].endswith("MovementContent"):
+        every = part.get("every", 1)
+        return part | {key: every * part[key] for key in ("window", "stride", "fps")} | {"every": 1}
     return part
