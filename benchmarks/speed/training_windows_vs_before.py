@@ -2,7 +2,8 @@
 
 For each experiment value and baseline are windows per second of a core's time, in batches (`Windows.batch`) and one by one
 (`benchmarks/rivals/single_windows`) at the experiment's batch size, by turns on one thread, medians, recordings open on
-both sides; ratio = value / baseline, to be at least `goal`. Loaders (`benchmarks/rivals/window_loaders.py`) are compared
+both sides; ratio = value / baseline, to be at least `goal`. `…_first`: the same windows when they are first drawn; one by
+one, this opens their recordings, for each of the people who do a motion. Loaders (`benchmarks/rivals/window_loaders.py`) are compared
 with motion_diffusion_head's windows on the same recordings: value is ours per core and baseline theirs, per process at
 work (`…_NAME`), or ours with one thread and theirs with as many processes as are fastest here (`…_NAME_processes_N`).
 Theirs have no augmentation, no noise and no bodies, which favours them.
@@ -47,10 +48,10 @@ def measure(
             config = config_of(experiment, Path(datasets or folder), *given)
             if not has_data(config):
                 continue
-            now, before = drawn_alone(config, batches, rounds)
-            figures.append(_figure(experiment, now, before, GOAL))
+            first, later = drawn_alone(config, batches, rounds)
+            figures += [_figure(experiment, *later, GOAL), _figure(f"{experiment}_first", *first, None)]
             if experiment == LOADED:
-                figures += against_loaders(config, now, workers, seconds, Path(folder))
+                figures += against_loaders(config, later[0], workers, seconds, Path(folder))
     return figures
 
 
@@ -58,16 +59,16 @@ def _figure(name: str, value: float, baseline: float, goal: float | None) -> dic
     return figure(f"training_windows_vs_before_{name}", value, UNIT, baseline, value / baseline, goal)
 
 
-def drawn_alone(config: DictConfig, batches: int, rounds: int) -> tuple[float, float]:
-    """Windows per second of a core's time, in batches and one by one."""
+def drawn_alone(config: DictConfig, batches: int, rounds: int) -> tuple[tuple[float, ...], ...]:
+    """Windows per second of a core's time, in batches and one by one: when they are first drawn, and later."""
     size, sides = config.data.loading.batch_size, []
     made: list[Any] = [data_now(config), data_before(config)]
     for windows in (data.dataset("train") for data in made):
         drawn = [samples(windows, size, seed) for seed in range(batches)]
         sides.append(lambda windows=windows, drawn=drawn: [windows.batch(*each) for each in drawn])
-    times = [[_core_seconds(side) for side in sides] for _ in range(rounds + 1)][1:]  # the first round opens recordings
-    now, before = (batches * size / statistics.median(side) for side in zip(*times))
-    return now, before
+    first, *later = [[_core_seconds(side) for side in sides] for _ in range(rounds + 1)]
+    medians = [statistics.median(side) for side in zip(*later)]
+    return tuple(tuple(batches * size / spent for spent in times) for times in (first, medians))
 
 
 def _core_seconds(run: Callable[[], object]) -> float:
