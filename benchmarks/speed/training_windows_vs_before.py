@@ -3,10 +3,11 @@
 For each experiment value and baseline are windows per second of a core's time, in batches (`Windows.batch`) and one by one
 (`benchmarks/rivals/single_windows`) at the experiment's batch size, by turns on one thread, medians, recordings open on
 both sides; ratio = value / baseline, to be at least `goal`. `…_first`: the same windows when they are first drawn; one by
-one, this opens their recordings, for each of the people who do a motion. Loaders (`benchmarks/rivals/window_loaders.py`) are compared
-with motion_diffusion_head's windows on the same recordings: value is ours per core and baseline theirs, per process at
-work (`…_NAME`), or ours with one thread and theirs with as many processes as are fastest here (`…_NAME_processes_N`).
-Theirs have no augmentation, no noise and no bodies, which favours them.
+one, this opens their recordings, for each of the people who do a motion.
+
+Loaders (`benchmarks/rivals/window_loaders.py`) are compared with motion_diffusion_head's windows on the same recordings:
+value is ours per core and baseline theirs, per process at work (`…_NAME`), or ours with one thread and theirs with as many
+processes as are fastest here (`…_NAME_processes_N`). Theirs have no augmentation, no noise and no bodies, which favours them.
 """
 
 import statistics
