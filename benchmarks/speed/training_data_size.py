@@ -3,7 +3,7 @@
     python -m benchmarks.speed.training_data_size FOLDER [--hours 40] [--clip-seconds 13] [--sources datasets/cmu] [--before]
 
 AMASS's size is 40 hours of clips of 13 s, Nymeria's `--hours 300 --clip-seconds 900`, at 30 frames a second: 0.1 GB an
-hour. A set that the folder has is used again. Each figure is of a process of its own, which trains mocap_every_mlp:
+hour. A set that the folder has is used again. Each figure is of a process of its own, which trains mocap_every:
 `…_prepare`: seconds until the first batch where nothing is cached; `…_start`: the same at the next start; `…_memory`: MB of
 its resident memory that the data takes after `seconds` of drawing; `…_windows`: windows per second of one thread. Baselines
 are windows drawn one by one (`--before`; else 0). `…_halves`: share of the windows of two processes (gloo) that are those of
@@ -13,6 +13,7 @@ one process, each in one of both; its baseline is 1.
 import argparse
 import json
 import os
+import shutil
 import socket
 import time
 from collections.abc import Callable, Sequence
@@ -34,6 +35,8 @@ from benchmarks.speed.training_paths import config_of, data_now, samples
 from benchmarks.speed.training_sets import generated, sources_of, write_set
 
 FPS = 30.0
+SET = "generated"
+"""Folder of the set."""
 
 
 class Start(NamedTuple):
@@ -56,9 +59,10 @@ def measure(
     """Of a set in a folder (None: a temporary one), generated of `sources` (None: bodies that swing their joints)."""
     with TemporaryDirectory() as temporary:
         root = Path(folder or temporary)
-        if not (root / "cmu" / "manifest.json").is_file():
+        if not (root / SET / "manifest.json").is_file():
             people = sources_of(Path(sources) if sources else None)
-            write_set(root / "cmu", generated(people, hours, clip_seconds, FPS))
+            write_set(root / SET, generated(people, hours, clip_seconds, FPS))
+        shutil.rmtree(root / SET / "cache", ignore_errors=True)
         sides = [[_alone(started, str(root), side, seconds) for _ in range(2)] for side in (False, True)[: 1 + before]]
         (first, again), (old_first, old_again) = sides[0], sides[-1] if before else (Start(0, 0, 0),) * 2
         name = f"training_data_size_{hours:g}h"
@@ -76,8 +80,9 @@ def measure(
 
 def _config(folder: str) -> DictConfig:
     """A training on the set alone, at its rate."""
-    given = "people@data.sources=none", "data.sources.simulated=null", "data.dataset.every=1"
-    return config_of("mocap_every_mlp", Path(folder), *given)
+    roots = [f"data.{kind}.cmu.root={Path(folder) / SET}" for kind in ("sources", "val_sources")]
+    alone = "people@data.sources=none", "data.sources.simulated=null", "data.dataset.every=1"
+    return config_of("mocap_every", Path(folder), *alone, *roots)
 
 
 def _alone(run: Callable[..., Any], *arguments: Any) -> Any:

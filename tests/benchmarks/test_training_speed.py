@@ -155,7 +155,7 @@ def test_losses_of_equal_trainings_are_equal_and_others_stand_apart(datasets, ca
 
 
 def test_ranks_draw_halves_of_one_sequence_of_a_generated_set(tmp_path):
-    write_set(tmp_path / "cmu", generated(sources_of(None), 40 / 3600, 6.0, size.FPS))
+    write_set(tmp_path / size.SET, generated(sources_of(None), 40 / 3600, 6.0, size.FPS))
     found = size.started(str(tmp_path), False, 0.1)
     assert found.windows_per_second > 0
     assert found.seconds > 0
