@@ -31,7 +31,12 @@ from benchmarks.speed.training_paths import (
 )
 
 GOAL = 1.5
-BEFORE = {"trainer.precision": "32-true", "model.compile": False, "optimizer.optimizer.fused": False}
+BEFORE = {
+    "trainer.precision": "32-true",
+    "model.compile": False,
+    "optimizer.optimizer.fused": False,
+    "callbacks.average._target_": "lightning.pytorch.callbacks.EMAWeightAveraging",
+}
 """Settings of trainings before, of those that there are."""
 PRECISE = {"echo": "bf16-mixed"}
 """Precision of experiments whose precision was another."""

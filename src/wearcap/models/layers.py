@@ -69,8 +69,21 @@ class _RotaryAttention(nn.Module):
     ) -> Float[Tensor, "batch token width"]:
         batch, tokens, width = x.shape
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(self._rotate(q), self._rotate(k), v, mask)
+        attended = attention(self._rotate(q), self._rotate(k), v, mask)
         return self.out(attended.transpose(1, 2).reshape(batch, tokens, width))
+
+
+def attention(
+    q: Float[Tensor, "batch head token depth"],
+    k: Float[Tensor, "batch head token depth"],
+    v: Float[Tensor, "batch head token depth"],
+    mask: Bool[Tensor, "batch 1 token token"],
+) -> Float[Tensor, "batch head token depth"]:
+    """PyTorch's fused attention, but for bfloat16 on a CPU, where the gradient of plain products is four times as fast."""
+    if not (q.device.type == "cpu" and q.requires_grad and v.dtype == torch.bfloat16):
+        return F.scaled_dot_product_attention(q, k, v, mask)
+    score = (q * q.shape[-1] ** -0.5) @ k.mT
+    return score.masked_fill(~mask, -torch.inf).softmax(-1) @ v
 
 
 def attention_mask(valid: Bool[Tensor, "batch token"]) -> Bool[Tensor, "batch 1 token token"]:

@@ -66,26 +66,21 @@ class Training(lightning.LightningModule):
         """Make dropout and augmentation of a step a function of seed and step, so that resumed runs repeat it."""
         torch.manual_seed((self.optimization.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
-    def _step(self, batch: tuple[Tensor, ...], stage: str) -> Tensor:
+    def training_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> Tensor:
         measured = self.measure(batch)
-        self.log_dict(
-            {f"{stage}/{name}": value for name, value in measured.items()},
-            batch_size=len(batch[0]),
-            prog_bar=stage == "train",
-            sync_dist=stage == "val",
-            on_step=stage == "train",
-            on_epoch=stage == "val",
-        )
+        if (self.global_step + 1) % max(1, self.trainer.log_every_n_steps) == 0:
+            values = {f"train/{name}": value.detach().clone() for name, value in measured.items()}
+            self.log_dict(values, batch_size=len(batch[0]), prog_bar=True)
         return measured["loss"]
 
-    def training_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> Tensor:
-        return self._step(batch, "train")
-
     def validation_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> None:
-        self._step(batch, "val")
+        values = {f"val/{name}": value for name, value in self.measure(batch).items()}
+        self.log_dict(values, batch_size=len(batch[0]), sync_dist=True)
 
     def configure_optimizers(self):
         optimizer = self.optimization.optimizer([each for each in self.parameters() if each.requires_grad])
+        # Lightning unscales gradients before it clips them, and refuses optimisers that would do so once more.
+        optimizer._step_supports_amp_scaling = False  # pyright: ignore[reportAttributeAccessIssue]
         if (scheduler := self.optimization.scheduler) is None:
             return optimizer
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler(optimizer), "interval": "step"}}

@@ -7,7 +7,8 @@ from pathlib import Path
 import lightning
 import torch
 from lightning.pytorch import Callback
-from lightning.pytorch.callbacks import RichProgressBar
+from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
+from lightning.pytorch.utilities.types import STEP_OUTPUT
 from rich.progress import TaskID
 
 from wearcap.metrics.table import aggregate
@@ -75,6 +76,49 @@ class CaptureValidation(Callback):
             self.draw(path, {"truth": recordings[0].motion} | {step: found[0] for step, found in motions.items()})
 
 
+class MovingAverage(WeightAveraging):
+    """An exponential moving average of the weights, in one operation for all of them and without waiting for a GPU.
+
+    Lightning's own averages them on the CPU if they move to a GPU after its `setup`, and asks the GPU in each step whether it
+    is the first.
+    """
+
+    state_key = "EMAWeightAveraging"  # pyright: ignore[reportAssignmentType]
+    """As in checkpoints that were written with Lightning's."""
+
+    def __init__(self, decay: float, use_buffers: bool = False):
+        """`decay`: share of the average that a step keeps. Buffers are copied, or averaged, too (`use_buffers`)."""
+        super().__init__(use_buffers=use_buffers)
+        self.decay = decay
+
+    def setup(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        self._device = trainer.strategy.root_device
+        super().setup(trainer, pl_module, stage)
+
+    def on_train_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: STEP_OUTPUT,
+        batch,
+        batch_idx: int,
+    ) -> None:
+        if trainer.global_step == self._latest_update_step or self._average_model is None:
+            return
+        first, self._latest_update_step = self._latest_update_step == 0, trainer.global_step
+        averaged = self._average_model.module
+        pairs = [*zip(averaged.parameters(), pl_module.parameters())]
+        copied = [*zip(averaged.buffers(), pl_module.buffers())]
+        if self._use_buffers:
+            pairs += [pair for pair in copied if pair[0].is_floating_point()]
+            copied = [pair for pair in copied if not pair[0].is_floating_point()]
+        with torch.no_grad():
+            torch._foreach_lerp_(*map(list, zip(*pairs)), 1.0 if first else 1 - self.decay)
+            if copied:
+                torch._foreach_copy_(*map(list, zip(*copied)))
+            self._average_model.n_averaged += 1
+
+
 class StepsProgressBar(RichProgressBar):
     """Progress in steps out of all that the run will make, in place of an epoch's batches."""
 
@@ -100,6 +144,11 @@ class StepsProgressBar(RichProgressBar):
     def _update(self, progress_bar_id: TaskID | None, current: int, visible: bool = True, hard: bool = False) -> None:
         steps = self.trainer.global_step if progress_bar_id == self.train_progress_bar_id else current
         super()._update(progress_bar_id, steps, visible, hard)
+
+    def _update_metrics(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Show metrics when they are logged: reading them in every step would make it wait for a GPU."""
+        if trainer.global_step % max(1, trainer.log_every_n_steps) == 0:
+            super()._update_metrics(trainer, pl_module)
 
     def _get_train_description(self, current_epoch: int) -> str:
         return f"epoch {current_epoch}, steps"
