@@ -14,7 +14,7 @@ from benchmarks.tables import echo_rows as rows
 from carried_box import WINDOW, carried_dataset, carrying, small_features, small_net
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
-from wearcap.data.windows import Source, Windows, collate
+from wearcap.data.windows import Source, Windows
 from wearcap.diffusion.levels import LevelMix
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
@@ -67,7 +67,7 @@ def dataset(features, *roots: str) -> Windows:
 
 def batch(features, *roots: str, count: int = 8) -> EchoWindow:
     windows = dataset(features, *roots)
-    return collate([windows[(k * 5 % len(windows), k)] for k in range(count)])
+    return windows.batch(torch.arange(count) * 5 % len(windows), torch.arange(count))
 
 
 def learner(net=None, frame: str = "own", features: EchoFeatures | None = None, **changes) -> EchoDiffusion:
@@ -300,7 +300,6 @@ def arguments(experiment: str, data: str, people: str, run: Path, *more: str) ->
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",
         f"data.dataset.window={WINDOW}",
-        "data.loading.workers=0",
         "data.dataset.content.encoder=null",
         "model.encoder=null",
         "features.shape_size=0",

@@ -18,18 +18,9 @@ from wearcap.models.checkpoint import read_checkpoint
 from wearcap.models.image_encoder import EgoViewEncoder
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
-from wearcap.systems.hmd2.egoview_frames import (
-    HANDS,
-    POINTS,
-    EgoFrame,
-    EgoFrames,
-    half_mirrored,
-    limb_points,
-    relit,
-    turned,
-)
+from wearcap.systems.hmd2.egoview_frames import HANDS, POINTS, EgoFrames, half_mirrored, limb_points, relit, turned
 from wearcap.systems.hmd2.egoview_training import view_scores
-from wearcap_testing import recording_of, swaying_motion
+from wearcap_testing import recording_of, swaying_motion, window_of
 from wearsim.sensors.slam import R_DEVICE_CAM
 
 CAMERA = Camera.pinhole(96, 72, 85)
@@ -110,7 +101,7 @@ def test_a_hand_is_where_the_picture_shows_it(data):
     assert len(frames) == 30
     shown = 0
     for index in range(len(frames)):
-        frame = frames[index]
+        frame = window_of(frames, index)
         for name, colour in zip(HANDS, COLOURS.values()):
             point = POINTS.index(name)
             near = (frame.picture.float() - torch.tensor(colour)).norm(dim=-1) < 90
@@ -127,10 +118,10 @@ def test_a_hand_is_where_the_picture_shows_it(data):
 
 
 def test_frames_are_decoded_once(data):
-    first = EgoFrames([Source(str(data))], "val", every=3)[5].picture
+    first = EgoFrames([Source(str(data))], "val", every=3).pictures[5]
     kept = sorted((data / "cache/ego_frames").glob("*.npy"))
     times = [path.stat().st_mtime_ns for path in kept]
-    assert torch.equal(EgoFrames([Source(str(data))], "val", every=3)[5].picture, first)
+    assert torch.equal(EgoFrames([Source(str(data))], "val", every=3).pictures[5], first)
     assert times == [path.stat().st_mtime_ns for path in kept]
 
 
@@ -150,7 +141,7 @@ def test_a_data_set_without_pictures_is_named(tmp_path):
 
 def test_mirror_images_swap_the_sides(data):
     frames = EgoFrames([Source(str(data))], "val", every=3)
-    batch = EgoFrame(*(torch.stack(field) for field in zip(*(frames[k] for k in range(30)))))
+    batch = frames.batch(torch.arange(30), torch.arange(30))
     pictures = batch.picture.movedim(-1, 1).float()
     torch.manual_seed(0)
     flipped_pictures, points, visible = half_mirrored(pictures, batch.point_cam, batch.visible)
@@ -188,7 +179,7 @@ def test_a_turned_camera_sees_points_where_its_picture_shows_them():
 
 def test_other_light_keeps_the_picture_recognisable(data):
     frames = EgoFrames([Source(str(data))], "val", every=3)
-    pictures = torch.stack([frames[k].picture for k in range(30)]).movedim(-1, 1) / 64 - 1.8
+    pictures = frames.pictures[:30].movedim(-1, 1) / 64 - 1.8
     torch.manual_seed(0)
     changed = relit(pictures)
     assert changed.isfinite().all()
@@ -245,7 +236,7 @@ def test_the_encoder_comes_out_of_the_checkpoint(learned, data):
     state = read_checkpoint(path)[1]
     assert torch.equal(encoder.bottleneck.weight, state["net.bottleneck.weight"])
     frames = EgoFrames([Source(str(data))], "val", every=3)
-    embedding = encoder.embed(torch.stack([frames[k].picture for k in range(30)]))
+    embedding = encoder.embed(frames.pictures[:30])
     assert embedding.std(0).mean() > 0.1  # it tells frames apart
 
 

@@ -78,8 +78,7 @@ def places(data, tmp_path_factory) -> Path:
             f"hydra.run.dir={run}",
             "trainer.max_steps=2",
             f"paths.outputs={run.parent}",
-            "data.dataset.window=20",
-            "data.dataset.content.frames=4",
+            "data.dataset.window=4",
             "data.loading.batch_size=4",
             "data.loading.steps_per_epoch=2",
             *QUIET,
@@ -227,9 +226,9 @@ class WristHeight(Condition):
 class WristHeights(ConditionWindows):
     size = 1
 
-    def read(self, store, name, start, stop, mirrored):
-        height = higher_wrist(store.load(name))[start:stop]
-        return height, torch.ones(len(height), dtype=torch.bool)
+    def frames(self, store, name):
+        height = higher_wrist(store.load(name))
+        return torch.stack([height, height], 1), torch.arange(len(height)).int()
 
 
 def test_a_new_condition_takes_a_class_a_reader_and_a_config(data, tmp_path, monkeypatch):

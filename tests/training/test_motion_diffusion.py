@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.windows import Source, Windows, collate
+from wearcap.data.windows import Source, Windows
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.models.layers import TransformerSize
@@ -16,7 +16,7 @@ from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.training import Levels, Loss, MotionDiffusion
 from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap.training.base import Optimization
-from wearcap_testing import small_dataset
+from wearcap_testing import seeded, small_dataset
 
 
 class Spy(nn.Module):
@@ -50,7 +50,7 @@ def system(batch, level_tilt: float, pure: float = 0.0) -> MotionDiffusion:
 def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_path):
     store = small_dataset(tmp_path)
     windows = Windows([Source(str(store.root))], "train", content=HeadContent(), window=60, stride=30, fps=60.0)
-    batch = collate([windows[(i % len(windows), i)] for i in range(400)])
+    batch = windows.batch(torch.arange(400) % len(windows), torch.arange(400))
     for tilt in (0.0, 2.0):
         module = system(batch, tilt)
         terms = module.terms(batch)
@@ -65,7 +65,7 @@ def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_pat
 def test_a_share_of_the_windows_is_pure_noise_and_the_others_keep_their_levels(tmp_path):
     store = small_dataset(tmp_path)
     windows = Windows([Source(str(store.root))], "train", content=HeadContent(), window=60, stride=30, fps=60.0)
-    batch = collate([windows[(i % len(windows), i)] for i in range(400)])
+    batch = windows.batch(torch.arange(400) % len(windows), torch.arange(400))
     module = system(batch, 0.0, pure=0.6)
     module.terms(batch)
     pure = module.net.level == 1
@@ -77,13 +77,13 @@ def test_all_windows_of_pure_noise_are_refused(tmp_path):
     store = small_dataset(tmp_path)
     windows = Windows([Source(str(store.root))], "train", content=HeadContent(), window=60, stride=30, fps=60.0)
     with pytest.raises(WearcapError, match="pure=1.0.*Expected from 0 to less than 1"):
-        system(collate([windows[(0, 0)]]), 0.0, pure=1.0)
+        system(seeded(windows, 0, 1), 0.0, pure=1.0)
 
 
 def test_the_last_frames_that_exist_weigh_more_by_the_tail(tmp_path):
     store = small_dataset(tmp_path)
     windows = Windows([Source(str(store.root))], "train", content=HeadContent(), window=60, stride=30, fps=60.0)
-    batch = collate([windows[(0, 0)]])
+    batch = seeded(windows, 0, 1)
     batch = batch._replace(valid=torch.arange(60)[None] < 50)
     module = system(batch, 0.0)
     truth = module.net.answer

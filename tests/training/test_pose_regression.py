@@ -16,7 +16,7 @@ from benchmarks.rivals.pose_regression.training import PoseRegression
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
 from wearcap.data.transforms import Mirror, Shift
-from wearcap.data.windows import Source, Windows, collate
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained
 from wearcap.systems.hmd2.features import HeadFeatures
@@ -46,7 +46,6 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
         f"paths.outputs={run.parent}",
         "trainer.accelerator=cpu",
         "trainer.precision=32-true",
-        "data.loading.workers=0",
         "data.dataset.window=60",
         "trainer.log_every_n_steps=1",
         "trainer.enable_progress_bar=false",
@@ -74,7 +73,7 @@ def batch(data: Path, split: str = "train", mirror: bool = False):
     windows = Windows(
         [Source(str(data))], split, mirror, content=HeadContent(), window=60, stride=30, fps=60.0, transforms=varied
     )
-    return collate([windows[(i % len(windows), i)] for i in range(16)])
+    return windows.batch(torch.arange(16) % len(windows), torch.arange(16))
 
 
 class Oracle(nn.Module):
@@ -109,8 +108,8 @@ def test_the_truth_costs_nothing_and_another_pose_does(data, mirror):
 def test_padding_is_no_lesson(data):
     """The recording of 90 frames ends within a window of 120: predictions behind its end cost nothing."""
     windows = Windows([Source(str(data))], "train", content=HeadContent(), window=120, stride=30, fps=60.0)
-    short = next(i for i, row in enumerate(windows.starts.tolist()) if row[2] == 90)
-    one = collate([windows[(short, 0)]])
+    (track,) = (windows.packed.length == 90).nonzero()[0]
+    one = windows.batch((windows.starts[:, 0] == track).nonzero()[0], torch.zeros(1).long())
     module = system(net=Oracle).eval()
     ends = module.frame_pairs(one)
     assert one.valid[0, ends[0]].tolist() == [True, True, True, False]

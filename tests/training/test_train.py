@@ -62,7 +62,7 @@ def checkpoint(data, tmp_path_factory) -> Path:
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_takes_a_step(experiment, data, tmp_path):
     run = tmp_path / "run"
-    changed = arguments(data, run, "trainer.precision=32-true", "data.loading.workers=0", "data.loading.batch_size=2")
+    changed = arguments(data, run, "trainer.precision=32-true", "data.loading.batch_size=2")
     train.main([f"experiment={experiment}", *changed[1:]])
     assert (run / "checkpoints" / "last.ckpt").is_file()
 
@@ -203,7 +203,6 @@ def test_overfits_one_batch(data, tmp_path):
         "data.loading.steps_per_epoch=1",
         "optimizer.optimizer.lr=0.01",
         "optimizer.scheduler.warmup=5",
-        "data.loading.workers=0",
         "callbacks.capture=null",
     ]
     train.main([a for a in arguments(data, run, *more) if a != "debug=fast"])

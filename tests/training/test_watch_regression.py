@@ -14,7 +14,7 @@ from benchmarks.tables import mocap_every
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import compose
-from wearcap.data.windows import Source, Windows, collate
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.io.formats.amass import read_amass
 from wearcap.io.formats.motion_npz import read_motion
@@ -69,7 +69,6 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
         f"paths.outputs={run.parent}",
         "trainer.accelerator=cpu",
         "trainer.precision=32-true",
-        "data.loading.workers=0",
         "trainer.log_every_n_steps=1",
         "trainer.enable_progress_bar=false",
         "callbacks.progress=null",
@@ -79,7 +78,7 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
 
 def batch(data: Path):
     windows = Windows([Source(str(data))], "train", content=WatchContent(), window=40, stride=10, fps=30.0, every=2)
-    return collate([windows[(k % len(windows), k)] for k in range(16)])
+    return windows.batch(torch.arange(16) % len(windows), torch.arange(16))
 
 
 def system(net=None, **features) -> WatchRegression:

@@ -41,10 +41,8 @@ class ConditionWindows:
     encoder: Any = None
     """The network that made them, or its name; None: none did."""
 
-    @property
-    def key(self) -> str:
-        """Digits that depend on what makes the features."""
-        raise NotImplementedError
+    key: str = ""
+    """What the features depend on beside the recording."""
 
     def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
         """Make or check what reading the recordings of a split needs."""
@@ -114,7 +112,7 @@ class PlaceCodes(ConditionWindows):
                 self.file_of(store.root, store.entries[name])
 
     @property
-    def key(self) -> str:
+    def key(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.fingerprint
 
     def frames(self, store: RecordingStore, name: str) -> Rows:
@@ -137,7 +135,7 @@ class Embeddings(ConditionWindows):
         _, self.size = embeddings_of(self.encoder, [*stores])
 
     @property
-    def key(self) -> str:
+    def key(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.encoder
 
     def frames(self, store: RecordingStore, name: str) -> Rows:
