@@ -1,5 +1,8 @@
-"""The base of the LightningModules: seeded steps, optimiser from the config, logged losses."""
+"""The base of the LightningModules: seeded and compiled steps, optimiser from the config, logged losses."""
 
+import os
+import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -7,6 +10,11 @@ from typing import Any, ClassVar
 import lightning
 import torch
 from torch import Tensor
+
+from wearcap.errors import require_choice
+
+WORTH_COMPILING = 1000
+"""Steps from which a compiled step saves a CPU more time than its compilation takes, a minute or two."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +29,16 @@ class Optimization:
     """Seed of dropout and augmentation."""
 
 
-class Training(lightning.LightningModule):
+class _Compilable(type):
+    """Every training has the setting `compile`, which its constructor need not pass on."""
+
+    def __call__(cls, *arguments: Any, compile: bool | str = "auto", **settings: Any) -> Any:
+        made = super().__call__(*arguments, **settings)
+        made.compiles = compile
+        return made
+
+
+class Training(lightning.LightningModule, metaclass=_Compilable):
     """Optimises the "loss" that `measure` returns, and logs all of its values, in training and validation.
 
     By default the loss is the sum of `terms` times `loss_weights`; a term without a weight is only logged.
@@ -29,6 +46,8 @@ class Training(lightning.LightningModule):
 
     system: ClassVar[type | None] = None
     """The system that captures with the network; None: none does."""
+    compiles: bool | str
+    """Whether training steps are compiled: True, False or "auto" (`_is_compiled`)."""
     parts: ClassVar[tuple[str, ...]] = ()
     """Attributes that are constructor arguments of the system's pipeline."""
 
@@ -62,12 +81,43 @@ class Training(lightning.LightningModule):
                 part.eval()
         return self
 
+    def on_train_start(self) -> None:
+        """Choose between the eager and the compiled `measure` of training steps; validation's stays eager."""
+        # Functions, since compiled modules would put every weight into checkpoints a second time.
+        self._measure = self._compiled() if self._is_compiled() else self.measure
+
+    def _is_compiled(self) -> bool:
+        """Whether training steps are compiled. "auto": on a GPU, and on a CPU for runs of `WORTH_COMPILING` steps of networks
+        without dropout, whose random numbers cost compiled code more than it saves."""
+        require_choice(str(self.compiles).lower(), ("true", "false", "auto"), f"model.compile={self.compiles!r}")
+        dropout = any(isinstance(part, torch.nn.Dropout) and part.p > 0 for part in self.modules())
+        pays = self.device.type == "cuda" or (self.trainer.max_steps >= WORTH_COMPILING and not dropout)
+        if self.compiles is False or (self.compiles == "auto" and not pays):
+            return False
+        compilers = (os.environ.get("CXX"), "g++", "clang++")
+        if any(shutil.which(name) for name in compilers if name):
+            return True
+        warnings.warn("no C++ compiler (g++, clang++, or $CXX): training steps are not compiled", stacklevel=2)
+        return False
+
+    def _compiled(self) -> Callable[[Any], dict[str, Tensor]]:
+        """`measure` compiled for batches of one shape; on a GPU it replays CUDA graphs."""
+        if self.device.type != "cuda":
+            return torch.compile(self.measure, dynamic=False)
+        replayed = torch.compile(self.measure, dynamic=False, mode="reduce-overhead")
+
+        def measure(batch: Any) -> dict[str, Tensor]:
+            torch.compiler.cudagraph_mark_step_begin()
+            return replayed(batch)
+
+        return measure
+
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Make dropout and augmentation of a step a function of seed and step, so that resumed runs repeat it."""
         torch.manual_seed((self.optimization.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def training_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> Tensor:
-        measured = self.measure(batch)
+        measured = self._measure(batch)
         if (self.global_step + 1) % max(1, self.trainer.log_every_n_steps) == 0:
             values = {f"train/{name}": value.detach().clone() for name, value in measured.items()}
             self.log_dict(values, batch_size=len(batch[0]), prog_bar=True)

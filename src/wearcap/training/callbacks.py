@@ -96,7 +96,12 @@ class MovingAverage(WeightAveraging):
         super().setup(trainer, pl_module, stage)
 
     def on_train_batch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: STEP_OUTPUT, batch, batch_idx: int
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: STEP_OUTPUT,
+        batch,
+        batch_idx: int,
     ) -> None:
         if trainer.global_step == self._latest_update_step or self._average_model is None:
             return

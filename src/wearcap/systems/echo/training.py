@@ -200,7 +200,7 @@ class EchoDiffusion(Training):
             if at >= len(self.features.points):
                 continue
             T_wrist_world = Rigid(batch.R_world_point[:, :, at], batch.t_world_point[:, :, at]).inverse()
-            found, true = T_wrist_world @ T_world_object, T_wrist_world @ batch.T_world_object
+            found, true = map(T_wrist_world.chain, (T_world_object, batch.T_world_object))
             turn, shift = (self.features.fps * (a - b).diff(dim=1) for a, b in ((found.R, true.R), (found.t, true.t)))
             square = _mean_square(turn, shift, batch.object_mean[:, 1:], batch.object_spread[:, 1:])
             same = (batch.object_mean[:, 1:] == batch.object_mean[:, :-1]).all(-1)

@@ -78,7 +78,6 @@ class MotionDiffusion(Training):
         loss: Loss,
         optimization: Optimization,
         conditions: Mapping[str, Mapping[str, Any]] | None = None,
-        compile: bool = False,
     ):
         """`conditions`: settings of those of `CONDITIONS` that the network has beside the head's path, by name."""
         super().__init__(optimization, loss.weights)
@@ -94,9 +93,6 @@ class MotionDiffusion(Training):
                 self.add_module(condition.weights, condition.encoder)
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
         self._feet = [skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")]
-        # Methods, since compiled modules would put every weight into checkpoints a second time.
-        self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
-        self._encode = torch.compile(self.net.encode) if compile else self.net.encode
 
     def pipeline_parts(self) -> dict[str, DiffusionModel]:
         parts = self.features, self.schedule, self.skeleton, self.fps, self.given
@@ -137,15 +133,15 @@ class MotionDiffusion(Training):
 
     def _predicted(self, batch: HeadWindow, x0: Tensor) -> Tensor:
         """x̂0 of a batch in normalised motion space; half the windows are self-conditioned on a first estimate."""
-        encoded = self._encode(self.conditions(batch), batch.valid)
+        encoded = self.net.encode(self.conditions(batch), batch.valid)
         level = self.levels.of(batch.level)
         x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
         if not self.net.self_conditioning:
-            return self._denoise(x_t, level, encoded, batch.valid)
+            return self.net(x_t, level, encoded, batch.valid)
         with torch.no_grad():
-            guess = self._denoise(x_t, level, encoded, batch.valid)
+            guess = self.net(x_t, level, encoded, batch.valid)
         last = guess * (batch.chance[:, -1] < 0.5)[:, None, None]
-        return self._denoise(x_t, level, encoded, batch.valid, last)
+        return self.net(x_t, level, encoded, batch.valid, last)
 
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
         valid = batch.valid  # padding weighs nothing
