@@ -5,16 +5,24 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import lightning
 import torch
+from lightning.pytorch.callbacks import Timer
 from torch import Tensor
 
 from wearcap.errors import require_choice
 
 WORTH_COMPILING = 1000
 """Steps from which a compiled step saves a CPU more time than its compilation takes, a minute or two."""
+
+
+def is_logged(trainer: lightning.Trainer, step: int) -> bool:
+    """Whether a step is one of those whose values are logged; reading them in others would only make it wait for a GPU."""
+    every: int = trainer.log_every_n_steps  # pyright: ignore[reportAttributeAccessIssue]
+    return every > 0 and step % every == 0
 
 
 @dataclass(frozen=True)
@@ -24,7 +32,8 @@ class Optimization:
     optimizer: Callable[..., torch.optim.Optimizer]
     """Called with the trained parameters."""
     scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None
-    """Called with the optimiser; it advances every step. None: a constant learning rate."""
+    """Called with the optimiser, and under `trainer.max_time` with `elapsed`, a function that gives the share of it that has
+    passed; it advances every step. None: a constant learning rate."""
     seed: int = 0
     """Seed of dropout and augmentation."""
 
@@ -118,7 +127,7 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
 
     def training_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> Tensor:
         measured = self._measure(batch)
-        if (self.global_step + 1) % max(1, self.trainer.log_every_n_steps) == 0:
+        if is_logged(self.trainer, self.global_step + 1):
             values = {f"train/{name}": value.detach().clone() for name, value in measured.items()}
             self.log_dict(values, batch_size=len(batch[0]), prog_bar=True)
         return measured["loss"]
@@ -133,4 +142,14 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
         optimizer._step_supports_amp_scaling = False  # pyright: ignore[reportAttributeAccessIssue]
         if (scheduler := self.optimization.scheduler) is None:
             return optimizer
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler(optimizer), "interval": "step"}}
+        timers = [each for each in self.trainer.callbacks if isinstance(each, Timer)]  # pyright: ignore[reportAttributeAccessIssue]
+        budget = {"elapsed": partial(self._elapsed, timers[0])} if timers else {}
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler(optimizer, **budget), "interval": "step"},
+        }
+
+    def _elapsed(self, timer: Timer) -> float:
+        """Share of `trainer.max_time` that has passed, before a resumed run was stopped too: the same in all processes."""
+        elapsed, left = timer.time_elapsed(), timer.time_remaining() or 0.0
+        return self.trainer.strategy.broadcast(elapsed / max(elapsed + left, 1e-9))
