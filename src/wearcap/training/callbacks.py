@@ -1,13 +1,16 @@
 """Callbacks, which observe a training run and do not change it."""
 
 import math
+import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
 from lightning.pytorch import Callback
-from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
+from lightning.pytorch.callbacks import RichProgressBar, Timer, WeightAveraging
 from lightning.pytorch.utilities.types import STEP_OUTPUT
 from rich.progress import TaskID
 
@@ -15,13 +18,13 @@ from wearcap.metrics.table import aggregate
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import first_seconds
 from wearcap.runtime.system import CaptureInput, Refine, System
-from wearcap.training.base import Training
+from wearcap.training.base import Training, is_logged
 
 
 def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
     """Whether a callback that runs at every n-th and at the last validation is due now, in this process."""
     last = trainer.max_steps > 0 and trainer.global_step >= trainer.max_steps
-    due = last or (trainer.current_epoch + 1) % every_n_epochs == 0
+    due = last or trainer.should_stop or (trainer.current_epoch + 1) % every_n_epochs == 0
     return due and trainer.is_global_zero and not trainer.sanity_checking
 
 
@@ -119,17 +122,91 @@ class MovingAverage(WeightAveraging):
             self._average_model.n_averaged += 1
 
 
+def steps_of_run(trainer: lightning.Trainer) -> float:
+    """The run's steps: `max_steps`, or those of `max_epochs` (infinite without either)."""
+    if trainer.max_steps > 0:
+        return trainer.max_steps
+    epochs = trainer.max_epochs
+    per_epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+    return epochs * per_epoch if epochs is not None and epochs > 0 else math.inf
+
+
+class Speed(Callback):
+    """Shows windows per second, the share of time that steps wait for windows, and minutes to the end of the run; logs them at
+    every validation, for the time since the one before, without the first step (`speed/…`).
+
+    Waiting begins when a step has ended and ends when the next has its batch: on a GPU by its own clock, which is read when the
+    GPU has come past it.
+    """
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self._start = time.perf_counter(), trainer.global_step
+        self._restart()
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self._restart()
+
+    def _restart(self) -> None:
+        self._windows, self._waited = 0, 0.0
+        self._began = self._until = None
+        self._pending: deque[tuple[Any, Any]] = deque()
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, pl_module, batch, batch_idx: int) -> None:
+        if self._began is not None:
+            self._pending.append((self._ended, _mark(pl_module.device)))
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module, outputs, batch, batch_idx: int) -> None:
+        self._until, self._ended = time.perf_counter(), _mark(pl_module.device)
+        if self._began is None:
+            self._began = self._until
+            return
+        self._windows += len(batch[0]) * trainer.world_size
+        while self._pending and (waited := _seconds(*self._pending[0])) is not None:
+            self._waited += waited
+            self._pending.popleft()
+        if is_logged(trainer, trainer.global_step):
+            pl_module.log_dict(self._values(trainer), prog_bar=True, logger=False)
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        if self._windows and not trainer.sanity_checking:
+            values = {f"speed/{name}": value for name, value in self._values(trainer).items()}
+            pl_module.log_dict(values, rank_zero_only=True)
+
+    def _values(self, trainer: lightning.Trainer) -> dict[str, float]:
+        assert self._began is not None
+        assert self._until is not None
+        seconds = self._until - self._began
+        values = {"windows_per_s": self._windows / seconds, "waiting": self._waited / seconds}
+        start, before = self._start
+        pace = (time.perf_counter() - start) / (trainer.global_step - before)
+        timers = [each for each in trainer.callbacks if isinstance(each, Timer)]  # pyright: ignore[reportAttributeAccessIssue]
+        left = [(steps_of_run(trainer) - trainer.global_step) * pace, *(each.time_remaining() for each in timers)]
+        return values | ({"minutes_left": min(left) / 60} if math.isfinite(min(left)) else {})
+
+
+def _mark(device: torch.device) -> Any:
+    """A point in time: of a GPU's queue, as an event, or of this process, in seconds."""
+    if device.type != "cuda":
+        return time.perf_counter()
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
+
+
+def _seconds(start: Any, end: Any) -> float | None:
+    """Seconds between two marks; None while a GPU has not come past them."""
+    if isinstance(end, float):
+        return end - start
+    return start.elapsed_time(end) / 1000 if end.query() else None
+
+
 class StepsProgressBar(RichProgressBar):
     """Progress in steps out of all that the run will make, in place of an epoch's batches."""
 
     @property
     def total_train_batches(self) -> int | float:
-        """The run's steps: `max_steps`, or those of `max_epochs` (infinite without either)."""
-        if self.trainer.max_steps > 0:
-            return self.trainer.max_steps
-        epochs = self.trainer.max_epochs
-        per_epoch = math.ceil(self.trainer.num_training_batches / self.trainer.accumulate_grad_batches)
-        return epochs * per_epoch if epochs is not None and epochs > 0 else math.inf
+        """The run's steps."""
+        return steps_of_run(self.trainer)
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Begin the bar in the first epoch; in later ones only their number changes."""
@@ -146,8 +223,8 @@ class StepsProgressBar(RichProgressBar):
         super()._update(progress_bar_id, steps, visible, hard)
 
     def _update_metrics(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Show metrics when they are logged: reading them in every step would make it wait for a GPU."""
-        if trainer.global_step % max(1, trainer.log_every_n_steps) == 0:
+        """Show metrics when they are logged."""
+        if is_logged(trainer, trainer.global_step):
             super()._update_metrics(trainer, pl_module)
 
     def _get_train_description(self, current_epoch: int) -> str:
