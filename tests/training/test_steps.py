@@ -29,7 +29,7 @@ class Small(Training):
     def __init__(self, dropout: float = 0.0, scheduler=None):
         super().__init__(Optimization(lambda weights: torch.optim.AdamW(weights, lr=0.01, fused=True), scheduler))
         torch.manual_seed(0)
-        self.net = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Dropout(dropout), nn.Linear(4, 1))
+        self.net = nn.Sequential(nn.Linear(3, 4, bias=False), nn.BatchNorm1d(4), nn.Dropout(dropout), nn.Linear(4, 1))
 
     def measure(self, batch):
         return {"loss": (self.net(batch[0]) - 1).square().mean()}
@@ -122,6 +122,40 @@ def test_compiled_steps_are_those_of_eager_ones():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr[-2000:]
     assert float(done.stdout.split()[-1]) < 1e-5
+
+
+HALVES = """
+import sys, torch
+from datetime import timedelta
+sys.path.insert(0, {folder!r})
+from test_steps import Batches, MovingAverage, Small, Speed, trainer, warmup_cosine
+
+class Half(Small):
+    def measure(self, batch):
+        rank, world = self.global_rank, self.trainer.world_size
+        return {{"loss": self.net(batch[0].repeat(2, 1)[rank::world]).square().mean()}}
+
+if __name__ == "__main__":
+    made = Half(scheduler=lambda optimizer, **more: warmup_cosine(optimizer, 2, 6))
+    made.net[1] = torch.nn.LayerNorm(4)
+    settings = dict(devices=2, strategy="ddp") if {processes} == 2 else dict()
+    trainer(MovingAverage(0.5), Speed(), max_steps=6, max_time=timedelta(hours=1), **settings).fit(made, Batches(6))
+    if made.global_rank == 0:
+        torch.save(made.state_dict(), {path!r})
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_agree_with_one(tmp_path):
+    states = []
+    for processes in (1, 2):
+        script, path = tmp_path / f"{processes}.py", str(tmp_path / f"{processes}.pt")
+        script.write_text(HALVES.format(folder=os.path.dirname(__file__), processes=processes, path=path))
+        done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=120)
+        assert done.returncode == 0, done.stderr[-2000:]
+        states.append(torch.load(path))
+    for name, value in states[0].items():
+        torch.testing.assert_close(value, states[1][name], msg=name)
 
 
 def test_the_learning_rate_follows_what_ends_first():
