@@ -144,16 +144,16 @@ class EchoDiffusion(Training):
 
     def terms(self, batch: EchoWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
-        frame = self.features.canonical(batch.points)
-        levels = self.levels(batch)
-        batch = self.knowable(batch, levels)
-        x0 = self.truth(batch, frame)
-        x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
-        condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
+        with losses.exact(batch.valid):
+            frame = self.features.canonical(batch.points)
+            levels = self.levels(batch)
+            batch = self.knowable(batch, levels)
+            x0 = self.truth(batch, frame)
+            x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
+            condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
         encoded = self.net.encode(condition, self.net.object(batch.object_code), batch.has_object, batch.valid)
         x0_hat = self.net(x_t, levels, encoded, batch.valid).float()
-        # Half precision is too coarse for millimetres.
-        with torch.autocast(x0_hat.device.type, enabled=False):
+        with losses.exact(x0):
             square = (x0_hat - x0).square() * self._counts(batch)
             weight = batch.valid.float()
             terms = {

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from einops import rearrange
+from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, Skeleton
@@ -133,7 +134,9 @@ class MotionDiffusion(Training):
 
     def _predicted(self, batch: HeadWindow, x0: Tensor) -> Tensor:
         """x̂0 of a batch in normalised motion space; half the windows are self-conditioned on a first estimate."""
-        encoded = self.net.encode(self.conditions(batch), batch.valid)
+        with losses.exact(x0):
+            conditions = self.conditions(batch)
+        encoded = self.net.encode(conditions, batch.valid)
         level = self.levels.of(batch.level)
         x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
         if not self.net.self_conditioning:
@@ -144,15 +147,23 @@ class MotionDiffusion(Training):
         return self.net(x_t, level, encoded, batch.valid, last)
 
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
+        with losses.exact(batch.t_world_head):
+            x0 = self.net.motion_normalizer(
+                self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+            )
+        x0_hat = self._predicted(batch, x0)
+        with losses.exact(x0):
+            return self._errors(x0_hat.float(), x0, batch)
+
+    def _errors(
+        self, x0_hat: Float[Tensor, "batch time motion"], x0: Float[Tensor, "batch time motion"], batch: HeadWindow
+    ) -> dict[str, Tensor]:
         valid = batch.valid  # padding weighs nothing
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
         weight = valid * (1 + self.loss.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
-        motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
-        x0 = self.net.motion_normalizer(motion)
-        x0_hat = self._predicted(batch, x0)
         terms = {"motion": losses.motion_mse(x0_hat, x0, weight)}
         if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate", "contact")):
-            motion_hat = self.net.motion_normalizer.inverse(x0_hat.float())
+            motion_hat = self.net.motion_normalizer.inverse(x0_hat)
             R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
             # As anchoring the body to the true head gives them.
             predicted, true = (batch.joints_from_head(self.skeleton, R) for R in (R_hat, batch.R_parent_joint))

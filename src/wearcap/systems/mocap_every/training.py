@@ -12,7 +12,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
-from wearcap.systems.mocap_every.model import TrainedEstimator
+from wearcap.systems.mocap_every.model import Estimate, TrainedEstimator
 from wearcap.systems.mocap_every.pipeline import MocapEvery, WatchModel
 from wearcap.systems.mocap_every.training_windows import WatchWindow
 from wearcap.training import losses
@@ -89,8 +89,15 @@ class WatchRegression(Training):
         return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[:, :, None]
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
-        features, true, canonical = self._inputs(batch)
+        with losses.exact(batch.t_world_root):
+            features, true, canonical = self._inputs(batch)
         output = self.net(features)
+        with losses.exact(batch.t_world_root):
+            return self._errors(output, true, canonical, batch)
+
+    def _errors(
+        self, output: Estimate, true: Float[Tensor, "batch time motion"], canonical: Rigid, batch: WatchWindow
+    ) -> dict[str, Tensor]:
         last = output.motion.shape[1]
         motion, true, contact = output.motion.float(), true[:, -last:], batch.foot_contact[:, -last:]
         every = torch.ones_like(contact[..., 0])
