@@ -1,6 +1,7 @@
 """Budgets, compiled steps, averages of weights and the speed of a run."""
 
 import csv
+import itertools
 import math
 import os
 import shutil
@@ -12,13 +13,14 @@ from types import SimpleNamespace
 import lightning
 import pytest
 import torch
-from lightning.pytorch.callbacks import EMAWeightAveraging, Timer
+from lightning.pytorch.callbacks import EMAWeightAveraging
+from lightning.pytorch.loggers import CSVLogger
 from torch import nn
 
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.models.layers import attention
-from wearcap.training.base import WORTH_COMPILING, Optimization, Training
+from wearcap.training.base import WORTH_COMPILING, Optimization, Training, timer_of
 from wearcap.training.callbacks import MovingAverage, Speed, StepsProgressBar
 from wearcap.training.schedules import warmup_cosine
 
@@ -83,7 +85,7 @@ def test_averages_are_lightnings(use_buffers):
     ],
 )
 def test_steps_are_compiled_where_it_pays(asked, dropout, steps, compiled, monkeypatch):
-    monkeypatch.setattr("shutil.which", lambda name: f"/bin/{name}")
+    monkeypatch.setattr("shutil.which", str)
     made = Small(dropout, compile=asked)
     made._trainer = SimpleNamespace(max_steps=steps)
     assert made._is_compiled() == compiled
@@ -136,7 +138,7 @@ class Half(Small):
         return {{"loss": self.net(batch[0].repeat(2, 1)[rank::world]).square().mean()}}
 
 if __name__ == "__main__":
-    made = Half(scheduler=lambda optimizer, **more: warmup_cosine(optimizer, 2, 6))
+    made = Half(scheduler=lambda optimizer, **more: warmup_cosine(optimizer, 2, 6, **more))
     made.net[1] = torch.nn.LayerNorm(4)
     settings = dict(devices=2, strategy="ddp") if {processes} == 2 else dict()
     trainer(MovingAverage(0.5), Speed(), max_steps=6, max_time=timedelta(hours=1), **settings).fit(made, Batches(6))
@@ -190,10 +192,11 @@ def test_a_budget_of_time_goes_on_where_it_was_left(tmp_path, monkeypatch):
     before = rates[-1]
     second = trainer(Rates(), max_steps=-1, **settings)
     second.fit(made(), Batches(4), ckpt_path=tmp_path / "x.ckpt", weights_only=False)
-    assert all(b < a for a, b in zip(rates[1:], rates[2:]))
+    assert all(b < a for a, b in itertools.pairwise(rates[1:]))
     assert 0.7 * before < rates[8] < before, "the share that had passed counts"
     assert rates[-1] < 0.001 * rates[1]
-    timer = next(each for each in second.callbacks if isinstance(each, Timer))
+    timer = timer_of(second)
+    assert timer is not None
     assert timer.time_elapsed() >= 100 > timer.time_elapsed() - 5 * 3
 
 
@@ -213,7 +216,7 @@ def test_a_run_shows_its_speed(tmp_path, monkeypatch):
         def val_dataloader(self):
             return Batches(2)
 
-    logged = lightning.pytorch.loggers.CSVLogger(tmp_path, name="", version="")
+    logged = CSVLogger(tmp_path, name="", version="")
     bar = StepsProgressBar()
     fitted = trainer(Speed(), bar, max_epochs=2, logger=logged, log_every_n_steps=2)
     fitted.fit(Slow(), Batches(6, lambda: later(1.0)))

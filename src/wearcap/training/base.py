@@ -25,6 +25,11 @@ def is_logged(trainer: lightning.Trainer, step: int) -> bool:
     return every > 0 and step % every == 0
 
 
+def timer_of(trainer: lightning.Trainer) -> Timer | None:
+    """The clock of a run with `trainer.max_time`."""
+    return next((each for each in trainer.callbacks if isinstance(each, Timer)), None)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 @dataclass(frozen=True)
 class Optimization:
     """How weights are found."""
@@ -91,9 +96,10 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
         return self
 
     def on_train_start(self) -> None:
-        """Choose between the eager and the compiled `measure` of training steps; validation's stays eager."""
-        # Functions, since compiled modules would put every weight into checkpoints a second time.
-        self._measure = self._compiled() if self._is_compiled() else self.measure
+        """Compile `measure` for training steps, where that pays; validation's stays eager."""
+        self._measure, mode = self.measure, "reduce-overhead" if self.device.type == "cuda" else None
+        if self._is_compiled():  # a function: a compiled module would put every weight into checkpoints a second time
+            self._measure = torch.compile(self.measure, dynamic=False, mode=mode)
 
     def _is_compiled(self) -> bool:
         """Whether training steps are compiled. "auto": on a GPU, and on a CPU for runs of `WORTH_COMPILING` steps of networks
@@ -101,25 +107,12 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
         require_choice(str(self.compiles).lower(), ("true", "false", "auto"), f"model.compile={self.compiles!r}")
         dropout = any(isinstance(part, torch.nn.Dropout) and part.p > 0 for part in self.modules())
         pays = self.device.type == "cuda" or (self.trainer.max_steps >= WORTH_COMPILING and not dropout)
-        if self.compiles is False or (self.compiles == "auto" and not pays):
+        if not (pays if self.compiles == "auto" else self.compiles):
             return False
-        compilers = (os.environ.get("CXX"), "g++", "clang++")
-        if any(shutil.which(name) for name in compilers if name):
-            return True
-        warnings.warn("no C++ compiler (g++, clang++, or $CXX): training steps are not compiled", stacklevel=2)
-        return False
-
-    def _compiled(self) -> Callable[[Any], dict[str, Tensor]]:
-        """`measure` compiled for batches of one shape; on a GPU it replays CUDA graphs."""
-        if self.device.type != "cuda":
-            return torch.compile(self.measure, dynamic=False)
-        replayed = torch.compile(self.measure, dynamic=False, mode="reduce-overhead")
-
-        def measure(batch: Any) -> dict[str, Tensor]:
-            torch.compiler.cudagraph_mark_step_begin()
-            return replayed(batch)
-
-        return measure
+        found = any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "clang++"))
+        if not found:
+            warnings.warn("no C++ compiler (g++, clang++ or $CXX): training steps are not compiled", stacklevel=2)
+        return found
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Make dropout and augmentation of a step a function of seed and step, so that resumed runs repeat it."""
@@ -142,14 +135,10 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
         optimizer._step_supports_amp_scaling = False  # pyright: ignore[reportAttributeAccessIssue]
         if (scheduler := self.optimization.scheduler) is None:
             return optimizer
-        timers = [each for each in self.trainer.callbacks if isinstance(each, Timer)]  # pyright: ignore[reportAttributeAccessIssue]
-        budget = {"elapsed": partial(self._elapsed, timers[0])} if timers else {}
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": scheduler(optimizer, **budget), "interval": "step"},
-        }
+        more = {"elapsed": partial(self._elapsed, timer)} if (timer := timer_of(self.trainer)) else {}
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler(optimizer, **more), "interval": "step"}}
 
     def _elapsed(self, timer: Timer) -> float:
-        """Share of `trainer.max_time` that has passed, before a resumed run was stopped too: the same in all processes."""
-        elapsed, left = timer.time_elapsed(), timer.time_remaining() or 0.0
-        return self.trainer.strategy.broadcast(elapsed / max(elapsed + left, 1e-9))
+        """Share of `trainer.max_time` that has passed, with earlier starts of the run: the same in all processes."""
+        passed = timer.time_elapsed()
+        return self.trainer.strategy.broadcast(passed / max(passed + (timer.time_remaining() or 0.0), 1e-9))

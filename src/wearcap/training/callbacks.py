@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,14 @@ from typing import Any
 import lightning
 import torch
 from lightning.pytorch import Callback
-from lightning.pytorch.callbacks import RichProgressBar, Timer, WeightAveraging
-from lightning.pytorch.utilities.types import STEP_OUTPUT
+from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
 from rich.progress import TaskID
 
 from wearcap.metrics.table import aggregate
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import first_seconds
 from wearcap.runtime.system import CaptureInput, Refine, System
-from wearcap.training.base import Training, is_logged
+from wearcap.training.base import Training, is_logged, timer_of
 
 
 def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
@@ -80,14 +78,12 @@ class CaptureValidation(Callback):
 
 
 class MovingAverage(WeightAveraging):
-    """An exponential moving average of the weights, in one operation for all of them and without waiting for a GPU.
+    """An exponential moving average of the weights, which a step updates in one operation without waiting for a GPU.
 
-    Lightning's own averages them on the CPU if they move to a GPU after its `setup`, and asks the GPU in each step whether it
-    is the first.
+    Lightning's own stays on the CPU when the weights go to a GPU, and asks the GPU in each step whether it is the first.
     """
 
-    state_key = "EMAWeightAveraging"  # pyright: ignore[reportAssignmentType]
-    """As in checkpoints that were written with Lightning's."""
+    state_key = "EMAWeightAveraging"  # pyright: ignore[reportAssignmentType]  # as in checkpoints with Lightning's
 
     def __init__(self, decay: float, use_buffers: bool = False):
         """`decay`: share of the average that a step keeps. Buffers are copied, or averaged, too (`use_buffers`)."""
@@ -98,28 +94,16 @@ class MovingAverage(WeightAveraging):
         self._device = trainer.strategy.root_device
         super().setup(trainer, pl_module, stage)
 
-    def on_train_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        outputs: STEP_OUTPUT,
-        batch,
-        batch_idx: int,
-    ) -> None:
+    @torch.no_grad()
+    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module, outputs, batch, batch_idx: int) -> None:
         if trainer.global_step == self._latest_update_step or self._average_model is None:
             return
-        first, self._latest_update_step = self._latest_update_step == 0, trainer.global_step
-        averaged = self._average_model.module
-        pairs = [*zip(averaged.parameters(), pl_module.parameters())]
-        copied = [*zip(averaged.buffers(), pl_module.buffers())]
-        if self._use_buffers:
-            pairs += [pair for pair in copied if pair[0].is_floating_point()]
-            copied = [pair for pair in copied if not pair[0].is_floating_point()]
-        with torch.no_grad():
-            torch._foreach_lerp_(*map(list, zip(*pairs)), 1.0 if first else 1 - self.decay)
-            if copied:
-                torch._foreach_copy_(*map(list, zip(*copied)))
-            self._average_model.n_averaged += 1
+        share = 1 - self.decay if self._latest_update_step else 1.0
+        self._latest_update_step, average = trainer.global_step, self._average_model.module
+        torch._foreach_lerp_([*average.parameters()], [*pl_module.parameters()], share)
+        for old, new in zip(average.buffers(), pl_module.buffers()):
+            old.lerp_(new, share) if self._use_buffers and old.is_floating_point() else old.copy_(new)
+        self._average_model.n_averaged += 1
 
 
 def steps_of_run(trainer: lightning.Trainer) -> float:
@@ -132,60 +116,50 @@ def steps_of_run(trainer: lightning.Trainer) -> float:
 
 
 class Speed(Callback):
-    """Shows windows per second, the share of time that steps wait for windows, and minutes to the end of the run; logs them at
-    every validation, for the time since the one before, without the first step (`speed/…`).
+    """Shows windows per second, the share of time that steps wait for them and minutes to the end of the run; logs them at every
+    validation (`speed/…`), of the steps since the one before but for the first.
 
-    Waiting begins when a step has ended and ends when the next has its batch: on a GPU by its own clock, which is read when the
-    GPU has come past it.
+    A wait is from a step's end to the next one's batch, in a GPU's own time, which is read when the GPU has come past it.
     """
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         self._start = time.perf_counter(), trainer.global_step
-        self._restart()
+        self.on_validation_end(trainer, pl_module)
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        self._restart()
-
-    def _restart(self) -> None:
-        self._windows, self._waited = 0, 0.0
-        self._began = self._until = None
-        self._pending: deque[tuple[Any, Any]] = deque()
+        self._waits: list[tuple[Any, Any]] = []
+        self._steps: list[tuple[float, int]] = []  # when they ended, and their windows
 
     def on_train_batch_start(self, trainer: lightning.Trainer, pl_module, batch, batch_idx: int) -> None:
-        if self._began is not None:
-            self._pending.append((self._ended, _mark(pl_module.device)))
+        if self._steps:
+            self._waits.append((self._ended, _mark(pl_module.device)))
 
     def on_train_batch_end(self, trainer: lightning.Trainer, pl_module, outputs, batch, batch_idx: int) -> None:
-        self._until, self._ended = time.perf_counter(), _mark(pl_module.device)
-        if self._began is None:
-            self._began = self._until
-            return
-        self._windows += len(batch[0]) * trainer.world_size
-        while self._pending and (waited := _seconds(*self._pending[0])) is not None:
-            self._waited += waited
-            self._pending.popleft()
-        if is_logged(trainer, trainer.global_step):
+        self._steps.append((time.perf_counter(), len(batch[0]) * trainer.world_size))
+        self._ended = _mark(pl_module.device)
+        if is_logged(trainer, trainer.global_step) and len(self._steps) > 1:
             pl_module.log_dict(self._values(trainer), prog_bar=True, logger=False)
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        if self._windows and not trainer.sanity_checking:
+        if len(self._steps) > 1:
             values = {f"speed/{name}": value for name, value in self._values(trainer).items()}
             pl_module.log_dict(values, rank_zero_only=True)
 
     def _values(self, trainer: lightning.Trainer) -> dict[str, float]:
-        assert self._began is not None
-        assert self._until is not None
-        seconds = self._until - self._began
-        values = {"windows_per_s": self._windows / seconds, "waiting": self._waited / seconds}
-        start, before = self._start
-        pace = (time.perf_counter() - start) / (trainer.global_step - before)
-        timers = [each for each in trainer.callbacks if isinstance(each, Timer)]  # pyright: ignore[reportAttributeAccessIssue]
-        left = [(steps_of_run(trainer) - trainer.global_step) * pace, *(each.time_remaining() for each in timers)]
-        return values | ({"minutes_left": min(left) / 60} if math.isfinite(min(left)) else {})
+        seconds, pace = self._steps[-1][0] - self._steps[0][0], time.perf_counter() - self._start[0]
+        left = pace / (trainer.global_step - self._start[1]) * (steps_of_run(trainer) - trainer.global_step)
+        if (timer := timer_of(trainer)) is not None:
+            left = min(left, timer.time_remaining() or 0.0)
+        values = {
+            "windows_per_s": sum(windows for _, windows in self._steps[1:]) / seconds,
+            "waiting": sum(_seconds(*wait) for wait in self._waits) / seconds,
+            "minutes_left": left / 60,
+        }
+        return {name: value for name, value in values.items() if math.isfinite(value)}
 
 
 def _mark(device: torch.device) -> Any:
-    """A point in time: of a GPU's queue, as an event, or of this process, in seconds."""
+    """A point in time: an event in a GPU's queue, or this process's clock (s)."""
     if device.type != "cuda":
         return time.perf_counter()
     event = torch.cuda.Event(enable_timing=True)
@@ -193,11 +167,11 @@ def _mark(device: torch.device) -> Any:
     return event
 
 
-def _seconds(start: Any, end: Any) -> float | None:
-    """Seconds between two marks; None while a GPU has not come past them."""
+def _seconds(start: Any, end: Any) -> float:
+    """Seconds between two marks; 0 until a GPU has come past them."""
     if isinstance(end, float):
         return end - start
-    return start.elapsed_time(end) / 1000 if end.query() else None
+    return start.elapsed_time(end) / 1000 if end.query() else 0.0
 
 
 class StepsProgressBar(RichProgressBar):

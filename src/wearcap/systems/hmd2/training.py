@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from einops import rearrange
-from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, Skeleton
@@ -148,16 +147,13 @@ class MotionDiffusion(Training):
 
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
         with losses.exact(batch.t_world_head):
-            x0 = self.net.motion_normalizer(
-                self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
-            )
+            motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+            x0 = self.net.motion_normalizer(motion)
         x0_hat = self._predicted(batch, x0)
         with losses.exact(x0):
             return self._errors(x0_hat.float(), x0, batch)
 
-    def _errors(
-        self, x0_hat: Float[Tensor, "batch time motion"], x0: Float[Tensor, "batch time motion"], batch: HeadWindow
-    ) -> dict[str, Tensor]:
+    def _errors(self, x0_hat: Tensor, x0: Tensor, batch: HeadWindow) -> dict[str, Tensor]:
         valid = batch.valid  # padding weighs nothing
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
         weight = valid * (1 + self.loss.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))

@@ -95,9 +95,7 @@ class WatchRegression(Training):
         with losses.exact(batch.t_world_root):
             return self._errors(output, true, canonical, batch)
 
-    def _errors(
-        self, output: Estimate, true: Float[Tensor, "batch time motion"], canonical: Rigid, batch: WatchWindow
-    ) -> dict[str, Tensor]:
+    def _errors(self, output: Estimate, true: Tensor, canonical: Rigid, batch: WatchWindow) -> dict[str, Tensor]:
         last = output.motion.shape[1]
         motion, true, contact = output.motion.float(), true[:, -last:], batch.foot_contact[:, -last:]
         every = torch.ones_like(contact[..., 0])
