@@ -1,39 +1,41 @@
 """The Lightning DataModule of every training."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import lightning
+import torch
+from jaxtyping import Int64
 from torch import Tensor
-from torch.utils.data import DataLoader
 
-from wearcap.data.windows import FixedSampler, SeededSampler, Source, collate
+from wearcap.data.windows import Source, drawn
+
+ON_DEVICE = 0.6
+"""Share of a device's free memory that recordings may take; larger data sets stay in the host's memory."""
 
 
-@runtime_checkable
 class _Drawn(Protocol):
-    """A data set with sampling weights, indexed by (sample, seed)."""
+    """A data set with sampling weights, of which whole batches are drawn."""
 
     weights: Tensor
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, item: tuple[int, int]) -> tuple[Tensor, ...]: ...
+    def batch(self, index: Int64[Tensor, "batch"], seed: Int64[Tensor, "batch"]) -> Any: ...
 
 
 @dataclass(frozen=True)
 class Loading:
-    """How samples are drawn and loaded."""
+    """How samples are drawn."""
 
     batch_size: int
     steps_per_epoch: int | None = None
     """Steps of an epoch, however many samples there are; None: as many as there are samples."""
     val_windows: int | None = None
     """Number of samples, evenly spread, of a validation; None: all."""
-    workers: int = 0
-    """Number of processes that load samples; 0: the training's own."""
     seed: int = 0
 
 
@@ -67,26 +69,74 @@ class WindowsModule(lightning.LightningDataModule):
     def setup(self, stage: str) -> None:
         if stage == "fit":
             self.train, self.val = self.dataset("train"), self.dataset("val")
+            for dataset in (self.train, self.val):
+                place(dataset, self._device)
 
-    def train_dataloader(self) -> DataLoader:
-        world = {"rank": self.trainer.global_rank, "world": self.trainer.world_size} if self.trainer else {}
-        steps = self.loading.steps_per_epoch or max(1, len(self.train) // self.loading.batch_size)
-        count = steps * self.loading.batch_size * world.get("world", 1)
-        return self._loader(self.train, SeededSampler(self.train.weights, count, self.loading.seed, **world))
+    @property
+    def _device(self) -> torch.device:
+        return self.trainer.strategy.root_device if self.trainer else torch.device("cpu")
 
-    def val_dataloader(self) -> DataLoader:
-        return self._loader(self.val, FixedSampler(len(self.val), self.loading.val_windows))
+    def train_dataloader(self) -> "Batches":
+        size, seed, trainer = self.loading.batch_size, self.loading.seed, self.trainer
+        rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
+        steps = self.loading.steps_per_epoch or max(1, len(self.train) // size)
+        upto = self.train.weights.cumsum(0)
 
-    def _loader(self, dataset: _Drawn, sampler: SeededSampler | FixedSampler) -> DataLoader:
-        workers = self.loading.workers
-        return DataLoader(
-            dataset,  # pyright: ignore[reportArgumentType]
-            self.loading.batch_size,
-            sampler=sampler,
-            num_workers=workers,
-            collate_fn=collate,
-            persistent_workers=workers > 0,
-            # A forked worker can inherit a held lock of the main process's threads and hang.
-            multiprocessing_context="forkserver" if workers else None,
-            pin_memory=self.trainer is not None and self.trainer.strategy.root_device.type == "cuda",
-        )
+        def numbered(step: int) -> tuple[Tensor, Tensor]:
+            """Windows and seeds of a step: ranks take turns in one sequence, which goes on from epoch to epoch."""
+            fixed = trainer is not None and trainer.overfit_batches > 0
+            epoch = 0 if trainer is None or fixed else trainer.current_epoch
+            first = (epoch * steps + step) * size * world + rank
+            numbers = (seed << 40) + first + world * torch.arange(size, device=upto.device)
+            return drawn(upto, numbers), numbers
+
+        return Batches(self.train, steps, numbered, self._device)
+
+    def val_dataloader(self) -> "Batches":
+        count, size = min(len(self.val), self.loading.val_windows or len(self.val)), self.loading.batch_size
+
+        def numbered(step: int) -> tuple[Tensor, Tensor]:
+            """Evenly spread windows with fixed seeds, so that every validation uses the same noise."""
+            seeds = torch.arange(step * size, min(count, (step + 1) * size), device=self.val.weights.device)
+            return seeds * len(self.val) // count, seeds
+
+        return Batches(self.val, -(-count // size), numbered, self._device)
+
+
+def place(dataset: _Drawn, device: torch.device) -> None:
+    """Move a data set that can be drawn on a device onto it, if it fits."""
+    packed = getattr(dataset, "packed", None)
+    if device.type == "cuda" and packed is not None and packed.bytes < ON_DEVICE * torch.cuda.mem_get_info(device)[0]:
+        dataset.to(device)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class Batches:
+    """The batches of an epoch: on the device that holds the recordings as they are asked for, else one ahead of the step."""
+
+    def __init__(
+        self, dataset: _Drawn, count: int, numbered: Callable[[int], tuple[Tensor, Tensor]], device: torch.device
+    ):
+        """`numbered` gives the samples and seeds of a step; batches go to `device`."""
+        self.data, self.count, self.numbered, self.device = dataset, count, numbered, device
+
+    def __len__(self) -> int:
+        return self.count
+
+    def _batch(self, step: int) -> Any:
+        with torch.no_grad():
+            batch = self.data.batch(*self.numbered(step))
+        if batch[0].device == self.device or self.device.type != "cuda":
+            return batch
+        return type(batch)(*(value.pin_memory().to(self.device, non_blocking=True) for value in batch))
+
+    def __iter__(self) -> Iterator[Any]:
+        if self.data.weights.device.type != "cpu":
+            yield from map(self._batch, range(self.count))
+            return
+        with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,)) as ahead:
+            coming = ahead.submit(self._batch, 0)
+            for step in range(self.count):
+                batch = coming.result()
+                if step + 1 < self.count:
+                    coming = ahead.submit(self._batch, step + 1)
+                yield batch

@@ -4,7 +4,7 @@ The windows of the head-driven networks have floors and heads as they were sense
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -12,14 +12,15 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.bodies import OtherPerson
+from wearcap.data.batch import Batch
 from wearcap.data.features import first_repeated
-from wearcap.data.transforms import Cut, Draws, Window, joint_twins
-from wearcap.data.windows import Content, Windows
+from wearcap.data.packing import Track
+from wearcap.data.transforms import joint_twins
+from wearcap.data.windows import Content
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.metrics.physics import CONTACT_SPEED_M_S, local_floor
-from wearcap.recording import Motion
+from wearcap.recording import Motion, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 
 CONTACT_HEIGHT_M = {"ankle": 0.12, "toe": 0.05}
@@ -106,27 +107,26 @@ class MotionFeatures:
 
 
 class MovementContent(Content):
-    """Complete windows of true motion, of which every `features.every`-th frame is used.
+    """Complete windows of true motion, of which every `features.every`-th frame is used."""
 
-    A recording's joints are computed at its first use and kept: 17 MB per hour at 20 frames a second.
-    """
-
-    draws = ("shift", "mirror")
+    own_rate = True
 
     def __init__(self, features: MotionFeatures):
-        self.features, self._twins = features, {"t_world_joint": joint_twins(features.skeleton)}
+        self.features = features
 
-    def cut(self, track: Movement, start: int, frames: int, every: int, windows: Windows) -> Cut:
-        every, length = self.features.every, len(track.floor_height)
-        stride = windows.stride // every
-        return Cut(start // every, windows.window // every, length, stride, stretch=windows.stretch)
+    def settings(self) -> Any:
+        return self.features
 
-    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> Movement:
-        return self.features.movement(RecordingFile(store.path_of(name)).part("motion"))
+    def twins(self, file: RecordingFile) -> dict[str, list[int]]:
+        return {"t_world_joint": joint_twins(self.features.skeleton)}
 
-    def read(self, track: Movement, cut: Cut, random: Draws) -> Window:
-        values = dict(zip(("t_world_joint", "R_world_root", "floor_height"), track))
-        return Window({name: cut.take(name, part) for name, part in values.items()}, self._twins)
+    def track(self, store: RecordingStore, name: str, recording: Recording, every: int) -> Track:
+        assert recording.motion is not None
+        if every != self.features.every:
+            what, expected = f"windows of every {every}th frame", f"every {self.features.every}th, as the features"
+            raise WearcapError(what, where=store.path_of(name), expected=expected)
+        joints, R_world_root, floor_height = self.features.movement(recording.motion)
+        return Track({"t_world_joint": joints, "R_world_root": R_world_root, "floor_height": floor_height})
 
-    def item(self, track: Movement, cut: Cut, window: Window, random: Draws) -> Movement:
-        return Movement(*window.values.values())
+    def batch(self, batch: Batch) -> Movement:
+        return Movement(*batch.values.values())

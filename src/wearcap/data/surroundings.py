@@ -3,21 +3,20 @@
 import hashlib
 import re
 from collections.abc import Sequence
-from functools import cache, cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int, Int64
 from rich.progress import track
 from torch import Tensor
 
-from wearcap.boundary.tensors import open_tensors, write_tensors
-from wearcap.data.windows import open_recording
+from wearcap.boundary.tensors import read_tensors, write_tensors
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_network
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.recording.store import Entry, RecordingStore
+from wearcap.recording.store import Entry, RecordingFile, RecordingStore
 from wearcap.scene.voxels import VoxelMap, mirrored
 
 MAX_PICTURE_AGE_S = 0.2
@@ -26,6 +25,8 @@ _AT_ONCE = 2048
 """Grids that are encoded at a time."""
 
 
+Rows = tuple[Float[Tensor, "row side feature"], Int[Tensor, "time"]]
+"""Features of a recording, on both sides of a mirror, and the row of each frame (-1: it has none)."""
 Features = tuple[Float[Tensor, "time feature"], Bool[Tensor, "time"]]
 """Features of a condition, and which frames have them; elsewhere they are any finite numbers."""
 
@@ -40,11 +41,16 @@ class ConditionWindows:
     encoder: Any = None
     """The network that made them, or its name; None: none did."""
 
+    @property
+    def key(self) -> str:
+        """Digits that depend on what makes the features."""
+        raise NotImplementedError
+
     def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
         """Make or check what reading the recordings of a split needs."""
 
-    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool) -> Features:
-        """Features of frames start…stop-1; `mirrored`: of everything mirrored left to right."""
+    def frames(self, store: RecordingStore, name: str) -> Rows:
+        """Features of a recording, of everything as it is and mirrored left to right, and the row of each head pose."""
         raise NotImplementedError
 
 
@@ -107,13 +113,18 @@ class PlaceCodes(ConditionWindows):
             for name in track(todo, f"points of {store.root.name}", disable=not todo):
                 self.file_of(store.root, store.entries[name])
 
-    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool) -> Features:
+    @property
+    def key(self) -> str:
+        return self.fingerprint
+
+    def frames(self, store: RecordingStore, name: str) -> Rows:
         """See `ConditionWindows`. Raises WearcapError as `file_of` does."""
-        codes = _codes(str(self.file_of(store.root, store.entries[name])))
-        rows, count = codes.get_slice("code_mirrored" if mirrored else "code"), stop - start
-        if not rows.get_shape()[0]:
-            return torch.zeros(count, self.size), torch.zeros(count, dtype=torch.bool)
-        return rows[start:stop].float(), torch.ones(count, dtype=torch.bool)
+        path = self.file_of(store.root, store.entries[name])
+        _, codes = read_tensors(path, "file of places", fix="Delete it: it is made again.")
+        table = torch.stack([codes["code"], codes["code_mirrored"]], 1)
+        count = RecordingFile(store.path_of(name)).length("head.timestamps")
+        row = torch.arange(count) if len(table) else torch.full((count,), -1)
+        return table, row.int()
 
 
 class Embeddings(ConditionWindows):
@@ -125,17 +136,18 @@ class Embeddings(ConditionWindows):
     def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
         _, self.size = embeddings_of(self.encoder, [*stores])
 
-    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool) -> Features:
-        path, count = store.path_of(name), stop - start
-        image, valid = torch.zeros(count, self.size), torch.zeros(count, dtype=torch.bool)
-        key = "camera.embedding_mirrored" if mirrored else "camera.embedding"
-        if _pictured(path) == self.encoder and key in open_recording(path).keys:
-            picture, valid = (part[start:stop] for part in _latest(path))
-            if valid.any():
-                first, last = picture[valid][[0, -1]].tolist()
-                shown = open_recording(path).window(key, first, last + 1).float()
-                image = shown[(picture - first).clamp(0, len(shown) - 1)]
-        return image, valid
+    @property
+    def key(self) -> str:
+        return self.encoder
+
+    def frames(self, store: RecordingStore, name: str) -> Rows:
+        file = RecordingFile(store.path_of(name))
+        count = file.length("head.timestamps")
+        if _pictured(file) != self.encoder or "camera.embedding_mirrored" not in file.keys:
+            return torch.zeros(0, 2, self.size).half(), torch.full((count,), -1).int()
+        table = torch.stack([file.tensor("camera.embedding"), file.tensor("camera.embedding_mirrored")], 1)
+        picture, valid = latest_before(file.tensor("camera.timestamps"), file.tensor("head.timestamps"))
+        return table.half(), torch.where(valid, picture, -1).int()
 
 
 _ENCODER_NAME = re.compile(r"[\w.-]+")
@@ -148,8 +160,8 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
     `encoder` is the full name or NAME alone. Raises WearcapError when there are none, or several kinds.
     """
     kinds: set[tuple[str, int]] = set()
-    for file in (open_recording(store.path_of(name)) for store in stores for name in store.names()):
-        full = _pictured(file.path)
+    for file in (RecordingFile(store.path_of(name)) for store in stores for name in store.names()):
+        full = _pictured(file)
         if full is not None and not _ENCODER_NAME.fullmatch(full):
             raise WearcapError(f"embeddings of {full[:80]!r}", where=file.path, expected="the plain name of an encoder")
         if full is not None and (full == encoder or full.startswith(f"{encoder}-")):
@@ -163,20 +175,9 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
     return kinds.pop()
 
 
-_codes = cache(partial(open_tensors, kind="file of places", fix="Delete it: it is made again."))
-
-
-@cache
-def _pictured(path: Path) -> str | None:
+def _pictured(file: RecordingFile) -> str | None:
     """Name of the encoder whose embeddings a recording has."""
-    file = open_recording(path)
     return file.part("camera").embedding_name if "camera.embedding" in file.keys else None
-
-
-@cache
-def _latest(path: Path) -> tuple[Int64[Tensor, "time"], Bool[Tensor, "time"]]:
-    file = open_recording(path)
-    return latest_before(file.tensor("camera.timestamps"), file.tensor("head.timestamps"))
 
 
 def latest_before(

@@ -1,183 +1,40 @@
 """Augmentations of training windows, the same for every system.
 
-A transform is a frozen dataclass: those of time change a `Cut`, which says what frames a window consists of, before the
-frames are read; those of space change the `Window` that was read. Values are named as in docs/conventions.md, and the
+A transform is a frozen dataclass that changes a whole `Batch`: with `cut` which frames its windows consist of, before
+these are read, or by being called the values that were read. Values are named as in docs/conventions.md, and the
 name tells a transform what to do: `R_world_head` turns with the world, `acc_world_wrist` grows with the square of the
-speed. All random numbers are the sample's own `Draws`.
+speed. Random numbers come from the batch's `Draws`, by names that no other transform uses.
 """
 
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from wearcap.body.skeleton import MIRROR, Skeleton
+from wearcap.data.batch import Batch
+from wearcap.data.draws import Draws
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.sensors.imu import GRAVITY, PUSHED, acceleration, mean_filter
-from wearcap.sensors.simulated import SlamNoise, slam_poses
+from wearcap.sensors.imu import GRAVITY, PUSHED
+from wearcap.sensors.simulated import DRIFT_S, SlamNoise
 from wearcap.sensors.watches import FILTER, MAX_GAP_S
 
-_RATES = {"vel": 1, "acc": 2}
-"""Power of the playback speed by which values of a kind grow, by the beginning of their names."""
-_BETWEEN = ("R", "t", "vel", "acc", "floor")
-"""Beginnings of names of values that are interpolated between frames; others are taken from the nearest frame."""
 _LENGTHS = ("t", "vel", "acc", "floor", "size")
 """Beginnings of names of values that are proportional to a length."""
 
 
-class Draws:
-    """Random numbers of one sample, a function of its seed.
-
-    The uniform numbers of `names` are drawn first and in this order, whether or not a transform uses them: a training
-    sees the same samples when another augmentation is switched off. Everything else comes from `generator` in turn.
-    """
-
-    def __init__(self, seed: int, names: tuple[str, ...] = ()):
-        self.generator = torch.Generator().manual_seed(seed)
-        self._first = dict(zip(names, torch.rand(len(names), generator=self.generator).tolist()))
-
-    def uniform(self, name: str) -> float:
-        """The number of this name, uniform in [0, 1)."""
-        return self._first[name] if name in self._first else torch.rand((), generator=self.generator).item()
-
-
-@dataclass(frozen=True)
-class Cut:
-    """The frames of a recording that a window consists of. Whole frames are read as they are, others interpolated."""
-
-    start: float
-    """First frame; a float is measured from the recording's first frame in single precision."""
-    count: int
-    """Number of the window's frames."""
-    length: int
-    """Number of the recording's frames; positions beyond the last one repeat it."""
-    stride: int = 1
-    """Frames of the recording between successive windows."""
-    step: int = 1
-    """Frames of the recording per frame of the window."""
-    latest: int | None = None
-    """Last possible start; None: as late as the window fits into the recording."""
-    stretch: float = 1.0
-    """Largest speed that a transform may set."""
-    speed: float | None = None
-    shown: tuple[int, int | None] = (0, None)
-    """Frame of the window that all earlier ones repeat, and number of frames before the padding, which repeats the
-    last of them (None: all)."""
-    kept: Bool[Tensor, "section"] | None = None
-    """Which frames of `section` were not dropped; sensed values are interpolated between them."""
-
-    @property
-    def section(self) -> int:
-        """Number of the recording's frames, from the start on, that the window may reach."""
-        return math.ceil(self.count * self.step * self.stretch) + 1
-
-    def _begin(self) -> float:
-        reach = (self.count - 1) * self.step * (1 if self.speed is None else self.speed)
-        return min(self.start, max(self.length - 1 - reach, 0) if self.latest is None else self.latest)
-
-    def _places(self) -> tuple[int, Tensor]:
-        """An origin, and the positions relative to it: whole numbers, or floats where frames are interpolated."""
-        begin, number = self._begin(), torch.arange(self.count)
-        if isinstance(begin, int):
-            return begin, self.step * number if self.speed is None else self.step * self.speed * number
-        return 0, begin + self.step * (1.0 if self.speed is None else self.speed) * number
-
-    @cached_property
-    def place(self) -> tuple[int, Tensor]:
-        """Origin and positions of the frames, within the recording and without padding."""
-        (origin, place), (first, shown) = self._places(), self.shown
-        if first:
-            place = place.clamp_min(place[first].item())
-        if shown is not None:
-            place = place.clamp_max(place[shown - 1].item())
-        return origin, place.clamp_max(self.length - 1 - origin)
-
-    @property
-    def valid(self) -> Bool[Tensor, "time"]:
-        """False for padding: frames after those that are shown, or after the recording's end."""
-        (origin, place), (_, shown) = self._places(), self.shown
-        return (torch.arange(self.count) < (self.count if shown is None else shown)) & (place < self.length - origin)
-
-    @cached_property
-    def frames(self) -> Int64[Tensor, "time"]:
-        """Nearest frame of the recording."""
-        origin, place = self.place
-        return origin + place.round().long()
-
-    @cached_property
-    def bounds(self) -> tuple[int, int]:
-        """The first frame that is read, and the one after the last."""
-        parts = [part for sensed in (False, True) for part in self.between(sensed)[:2]]
-        return min(int(part.min()) for part in parts), max(int(part.max()) for part in parts) + 1
-
-    def between(
-        self, sensed: bool = False
-    ) -> tuple[Int64[Tensor, "time"], Int64[Tensor, "time"], Float[Tensor, "time"]]:
-        """The frames before and after every position, and its share of the way between them."""
-        origin, place = self.place
-        last = self.length - 1 - origin
-        if sensed and self.kept is not None:
-            frames = self.kept.nonzero()[:, 0] + (0 if origin else int(self._begin()))
-            after = torch.searchsorted(frames, place, right=True).clamp(1, len(frames) - 1)
-            low, high = frames[after - 1], frames[after]
-            return origin + low.clamp_max(last), origin + high.clamp_max(last), (place - low) / (high - low)
-        low = place.long()
-        return origin + low, origin + (low + 1).clamp_max(last), (place - low).float()
-
-    def take(self, name: str, part: Tensor, first: int = 0, *, sensed: bool = False, smooth: bool = False) -> Tensor:
-        """The window's values of a recording ("frame ..."), of which `part` starts at frame `first`.
-
-        Rotations, positions, rates and floor heights are interpolated (rotations are orthogonalised), others are those
-        of the nearest frame. `sensed` values suffer from dropped frames. `smooth` also passes whole frames through the
-        interpolation.
-        """
-        kind = name.split("_")[0]
-        if kind not in _BETWEEN:
-            return part[self.frames - first]
-        low, high, share = self.between(sensed)
-        if not smooth and not self.place[1].is_floating_point() and not (sensed and self.kept is not None):
-            return part[low - first]
-        blend = share.reshape(-1, *[1] * (part.ndim - 1)).to(part.dtype)
-        value = torch.lerp(part[low - first], part[high - first], blend)
-        if kind == "R":
-            return rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(value))
-        return value if kind not in _RATES or self.speed is None else self.speed ** _RATES[kind] * value
-
-
-@dataclass(frozen=True)
-class Window:
-    """Values of a window by their names, "time ..." each or without time (`size`, `t_parent_joint`)."""
-
-    values: dict[str, Tensor]
-    twins: dict[str, list[int]] = field(default_factory=dict)
-    """What a mirror exchanges: the order of joints, wrists, feet … of the mirrored values, by their names."""
-    mirrored: bool = False
-    scale: float = 1.0
-    fps: float = math.nan
-    """Frames per second, which `Windows` fills in."""
-
-    def changed(self, **values: Tensor) -> "Window":
-        """The window with other values."""
-        return replace(self, values=self.values | values)
-
-
 @runtime_checkable
-class TimeTransform(Protocol):
-    """Changes which frames a window consists of."""
+class Cutting(Protocol):
+    """A transform of the frames that windows consist of."""
 
-    def retimed(self, cut: Cut, random: Draws) -> Cut: ...
-
-
-Transform = Callable[[Window, Draws], Window]
-"""Changes the values of a window."""
+    def cut(self, batch: Batch) -> Batch: ...
 
 
 @dataclass(frozen=True)
@@ -187,9 +44,9 @@ class Shift:
     whole_frames: bool = True
     """Whether by a whole number of frames; otherwise frames are interpolated."""
 
-    def retimed(self, cut: Cut, random: Draws) -> Cut:
-        later = random.uniform("shift") * cut.stride
-        return replace(cut, start=cut.start + (int(later) if self.whole_frames else later))
+    def cut(self, batch: Batch) -> Batch:
+        later = batch.draws.uniform("shift").double() * batch.stride
+        return replace(batch, later=later.long() if self.whole_frames else later)
 
 
 @dataclass(frozen=True)
@@ -198,8 +55,8 @@ class TimeStretch:
 
     factor: float = 1.2
 
-    def retimed(self, cut: Cut, random: Draws) -> Cut:
-        return replace(cut, speed=self.factor ** (2 * random.uniform("speed") - 1))
+    def cut(self, batch: Batch) -> Batch:
+        return replace(batch, speed=_factors(batch, "speed", self.factor), stretch=self.factor)
 
 
 @dataclass(frozen=True)
@@ -208,11 +65,11 @@ class DropFrames:
 
     share: float = 0.2
 
-    def retimed(self, cut: Cut, random: Draws) -> Cut:
-        share = self.share * torch.rand(1, generator=random.generator)
-        kept = torch.rand(cut.section, generator=random.generator) >= share
-        kept[[0, -1]] = True
-        return replace(cut, kept=kept)
+    def cut(self, batch: Batch) -> Batch:
+        share = self.share * batch.draws.uniform("dropped share", 1)
+        kept = batch.draws.uniform("dropped", batch.section) >= share
+        kept[:, [0, -1]] = True
+        return replace(batch, kept=kept)
 
 
 @dataclass(frozen=True)
@@ -222,10 +79,9 @@ class EarlyEnd:
     share: float
     least: int = 10
 
-    def retimed(self, cut: Cut, random: Draws) -> Cut:
-        share, end = random.uniform("ends"), random.uniform("end")
-        shown = cut.shown[0], self.least + int(end * (cut.count - self.least))
-        return replace(cut, shown=shown) if share < self.share else cut
+    def cut(self, batch: Batch) -> Batch:
+        end = self.least + (batch.draws.uniform("end") * (batch.count - self.least)).long()
+        return replace(batch, end=torch.where(batch.draws.uniform("ends") < self.share, end, batch.count))
 
 
 @dataclass(frozen=True)
@@ -234,26 +90,25 @@ class StillStart:
 
     share: float
 
-    def retimed(self, cut: Cut, random: Draws) -> Cut:
-        share, until = random.uniform("begins"), random.uniform("begin")
-        shown = int(until * (cut.count - 2)), cut.shown[1]
-        return replace(cut, shown=shown) if share < self.share else cut
+    def cut(self, batch: Batch) -> Batch:
+        begin = (batch.draws.uniform("begin") * (batch.count - 2)).long()
+        return replace(batch, begin=torch.where(batch.draws.uniform("begins") < self.share, begin, 0))
 
 
 @dataclass(frozen=True)
 class Mirror:
     """Mirrors half of the windows left to right."""
 
-    def __call__(self, window: Window, random: Draws) -> Window:
-        return mirrored(window) if random.uniform("mirror") < 0.5 else window
+    def cut(self, batch: Batch) -> Batch:
+        return replace(batch, mirrored=batch.draws.uniform("mirror") < 0.5)
 
 
 @dataclass(frozen=True)
 class Yaw:
     """Turns the world about its vertical by any angle."""
 
-    def __call__(self, window: Window, random: Draws) -> Window:
-        return turned(window, 2 * torch.pi * random.uniform("yaw"))
+    def __call__(self, batch: Batch) -> Batch:
+        return turned(batch, 2 * torch.pi * batch.draws.uniform("yaw"))
 
 
 @dataclass(frozen=True)
@@ -262,8 +117,13 @@ class Scale:
 
     factor: float = 1.1
 
-    def __call__(self, window: Window, random: Draws) -> Window:
-        return scaled(window, self.factor ** (2 * random.uniform("scale") - 1))
+    def __call__(self, batch: Batch) -> Batch:
+        return scaled(batch, _factors(batch, "scale", self.factor))
+
+
+def _factors(batch: Batch, name: str, largest: float) -> Float[Tensor, "batch"]:
+    """Factors from 1 / `largest` to `largest`."""
+    return torch.exp(math.log(largest) * (2 * batch.draws.uniform(name) - 1))
 
 
 @dataclass(frozen=True)
@@ -289,8 +149,7 @@ class SensorErrors:
     """Errors of trackers and watches, of the floor and of the body's size.
 
     They are constant within a window, where they say no other, and standard deviations, those of orientations about each
-    axis and of positions along each. Values that a window lacks are left out. Random numbers are drawn for the first
-    seven in any case, for those of `watches` unless they are 0.
+    axis and of positions along each. Values that a window lacks are left out.
     """
 
     head_deg: float = 0.0
@@ -309,170 +168,240 @@ class SensorErrors:
     """Of the head's tracked path; None: none."""
     watches: WatchErrors = WatchErrors()
 
-    def __call__(self, window: Window, random: Draws) -> Window:
+    def __call__(self, batch: Batch) -> Batch:
         """What moves differently or at another time comes first, what is measured wrongly follows."""
-        generator, watches = random.generator, self.watches
         if self.slam is not None:
-            window = _tracked(window, self.slam, generator)
-        window = _worn(window, ((_slack, watches.play_deg), (_delayed, watches.delay_s)), generator)
-        window = _constant(window, self, generator)
-        measured = (_tilted, watches.tilt_deg), (_biased, watches.bias_m_s2), (_silenced, watches.silent)
-        return _worn(window, measured, generator)
+            batch = _tracked(batch, self.slam)
+        batch = _worn(batch, ((_slack, self.watches.play_deg), (_delayed, self.watches.delay_s)))
+        batch = _constant(batch, self)
+        measured = (_tilted, self.watches.tilt_deg), (_biased, self.watches.bias_m_s2), (_silenced, self.watches.silent)
+        return _worn(batch, measured)
 
 
-def _constant(window: Window, errors: SensorErrors, generator: torch.Generator) -> Window:
+def _constant(batch: Batch, errors: SensorErrors) -> Batch:
     """With constant errors of places, orientations, floor and size, and white noise of accelerations."""
-    values, changed = window.values, {}
-    angle = torch.randn(3, 3, generator=generator).deg2rad()
-    turn = rotation.exp(angle * torch.tensor([[errors.wrist_deg], [errors.wrist_deg], [errors.head_deg]]))
-    for name, order in (("R_world_wrist", [0, 1]), ("R_world_head", 2), ("R_world_point", [2, 0, 1])):
-        if name in values:
-            changed[name] = values[name] @ turn[order]
+    values, draws, changed = batch.values, batch.draws, {}
+    head, wrist = ("head", errors.head_deg, errors.head_m), ("wrist", errors.wrist_deg, errors.wrist_m)
+    turn, seat = {}, {}
+    for name, deg, metres in (head, wrist):
+        count = 1 if name == "head" else 2
+        turn[name] = rotation.exp(math.radians(deg) * draws.normal(f"{name} turned", 1, count, 3))
+        seat[name] = metres * draws.normal(f"{name} seat", 1, count, 3)
+    turn["point"], seat["point"] = (torch.cat([each["head"], each["wrist"]], 2) for each in (turn, seat))
+    turn["head"], seat["head"] = turn["head"][:, :, 0], seat["head"][:, :, 0]
     if (acc := values.get("acc_world_wrist")) is not None:
-        noise = torch.randn(acc.shape, generator=generator)
-        changed["acc_world_wrist"] = (turn[:2] @ acc[..., None])[..., 0] + errors.acc_m_s2 * noise
-    floor = errors.floor_m * torch.randn(1, generator=generator)
+        changed["acc_world_wrist"] = _applied(turn["wrist"], acc)
+        if errors.acc_m_s2:
+            changed["acc_world_wrist"] += errors.acc_m_s2 * draws.normal("acceleration", *acc.shape[1:])
+    floor = errors.floor_m * draws.normal("floor", 1)
     changed |= {name: value + floor for name, value in values.items() if name.startswith("floor")}
-    seat = torch.randn(3, 3, generator=generator)
-    seat = seat * torch.tensor([[errors.wrist_m], [errors.wrist_m], [errors.head_m]])
-    for point, order in (("wrist", [0, 1]), ("head", 2), ("point", [2, 0, 1])):
-        t, R = f"t_world_{point}", f"R_world_{point}"
-        if t in values and R in values:
-            changed[t] = values[t] + (values[R] @ seat[order][..., None])[..., 0]
+    for name in ("head", "wrist", "point"):
+        R, t = values.get(f"R_world_{name}"), values.get(f"t_world_{name}")
+        if R is not None:
+            changed[f"R_world_{name}"] = _turned_about(R, turn[name])
+            if t is not None:
+                changed[f"t_world_{name}"] = t + _applied(R, seat[name])
     if errors.wrist_m and "acc_world_wrist" in values:
-        lever = (values["R_world_wrist"] @ seat[:2, :, None])[..., 0]
-        changed["acc_world_wrist"] = changed["acc_world_wrist"] + _filtered_acceleration(lever, window.fps)
+        lever = _applied(values["R_world_wrist"], seat["wrist"])
+        changed["acc_world_wrist"] = changed["acc_world_wrist"] + filtered_acceleration(lever, batch.fps)
     if (size := values.get("size")) is not None:
-        changed["size"] = size * (1 + errors.size * torch.randn(size.shape, generator=generator))
-    return window.changed(**changed)
+        changed["size"] = size * (1 + errors.size * draws.normal("size", size.shape[-1]))
+    return batch.changed(**changed)
 
 
-def _filtered_acceleration(t: Float[Tensor, "time wrist 3"], fps: float) -> Float[Tensor, "time wrist 3"]:
-    """Acceleration (m/s²) of points as watches give it (MocapEvery eq. 8)."""
-    return mean_filter(acceleration(t.flatten(1), fps), FILTER).unflatten(1, t.shape[1:])
+def _turned_about(
+    R: Float[Tensor, "batch time *point 3 3"], turn: Float[Tensor, "batch 1 *point 3 3"]
+) -> Float[Tensor, "batch time *point 3 3"]:
+    """R @ turn, as one product for all frames: many of 3x3 take several times as long."""
+    rows = R.movedim(1, -3).flatten(-3, -2)
+    return (rows @ turn[:, 0]).unflatten(-2, (-1, 3)).movedim(-3, 1)
 
 
-def _tracked(window: Window, noise: SlamNoise, generator: torch.Generator) -> Window:
+def _applied(R: Float[Tensor, "*#batch 3 3"], vector: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    return (R * vector[..., None, :]).sum(-1)
+
+
+def filtered_acceleration(
+    t: Float[Tensor, "batch time wrist 3"], fps: float, n: int = 4
+) -> Float[Tensor, "batch time wrist 3"]:
+    """Acceleration (m/s²) of points as watches give it (MocapEvery eq. 8); ends repeat the nearest frame that has one."""
+    count = t.shape[1]
+    if count <= 2 * n:
+        return torch.zeros_like(t)
+    inner = (t[:, : -2 * n] + t[:, 2 * n :] - 2 * t[:, n:-n]) * (fps / n) ** 2
+    flat = inner.flatten(2).mT
+    half = FILTER // 2
+    return F.avg_pool1d(F.pad(flat, (n + half, n + half), mode="replicate"), FILTER, 1).mT.reshape(t.shape)
+
+
+def _tracked(batch: Batch, noise: SlamNoise) -> Batch:
     """With the head's path as SLAM tracks it, and with it the points that are tracked from the head."""
-    values, points = window.values, "R_world_point" in window.values
-    if not points and "R_world_head" not in values:
-        return window
-    name = "point" if points else "head"
+    values, name = batch.values, "point" if "R_world_point" in batch.values else "head"
+    if f"R_world_{name}" not in values:
+        return batch
     true = Rigid(values[f"R_world_{name}"], values[f"t_world_{name}"])
-    head = Rigid(true.R[:, 0], true.t[:, 0]) if points else true
-    rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
-    sensed, _ = slam_poses(head, window.fps, noise, rng)
-    if points:
-        seen: Rigid = (sensed @ head.inverse())[:, None] @ true  # pyright: ignore[reportAssignmentType]
-        return window.changed(R_world_point=seen.R, t_world_point=seen.t)
+    head = Rigid(true.R[:, :, 0], true.t[:, :, 0]) if name == "point" else true
+    sensed = slam_paths(head, batch.fps, noise, batch.draws)
+    moved: Rigid = sensed @ head.inverse()
+    if name == "point":
+        seen: Rigid = moved[:, :, None] @ true  # pyright: ignore[reportAssignmentType]
+        return batch.changed(R_world_point=seen.R, t_world_point=seen.t)
     changed = {"R_world_head": sensed.R, "t_world_head": sensed.t}
     if (wrist := values.get("t_world_wrist")) is not None:
-        changed["t_world_wrist"] = (sensed @ head.inverse())[:, None] @ wrist
-    return window.changed(**changed)
+        changed["t_world_wrist"] = moved[:, :, None] @ wrist
+    return batch.changed(**changed)
+
+
+def slam_paths(T_world_device: Rigid, fps: float, noise: SlamNoise, draws: Draws) -> Rigid:
+    """Paths of a device as SLAM tracks them: `sensors.simulated.slam_poses` for the windows of a batch."""
+    R, t = T_world_device.R, T_world_device.t
+    jitter = _smooth("jitter", t, draws, noise.jitter_period_s * fps)
+    R = R @ rotation.exp(math.radians(noise.jitter_deg) * jitter[..., :3])
+    step = t.diff(dim=1, prepend=t[:, :1]).norm(dim=-1, keepdim=True)
+    t = t + noise.jitter_m * jitter[..., 3:]
+    if noise.drift_share or noise.yaw_drift_deg_per_sqrt_min:
+        off = noise.drift_share * (draws.normal("drift", *t.shape[1:]) * step.sqrt()).cumsum(1)
+        yaw = (
+            draws.normal("yaw drift", t.shape[1]) * math.radians(noise.yaw_drift_deg_per_sqrt_min) / math.sqrt(60 * fps)
+        )
+        yaw[:, 0] = 0.0
+        turn = rotation.about_axis("z", yaw.cumsum(1))
+        path = t + off - t[:, :1]
+        off = _blurred(off + _applied(turn, path) - path, DRIFT_S * fps)
+        R, t = turn @ R, t + off - off[:, :1]
+    if noise.wander_m or noise.wander_deg:
+        wander = _smooth("wander", t, draws, noise.wander_period_s * fps) / math.sqrt(3)
+        R = rotation.exp(math.radians(noise.wander_deg) * wander[..., :3]) @ R
+        t = t + noise.wander_m * wander[..., 3:]
+    if noise.lean_deg or noise.scale:
+        lean = math.radians(noise.lean_deg) / math.sqrt(2) * draws.normal("lean", 1, 3)
+        world = rotation.exp(F.pad(lean[..., :2], (0, 1)))
+        scale = 1 + noise.scale * draws.normal("stretched world", 1, 1)
+        R, t = world @ R, t[:, :1] + scale * _applied(world, t - t[:, :1])
+    return Rigid(R, t)
+
+
+def _smooth(
+    name: str, like: Float[Tensor, "batch time 3"], draws: Draws, period: float
+) -> Float[Tensor, "batch time 6"]:
+    """Gaussian noise of unit deviation that changes over about `period` frames."""
+    sigma = period / 4
+    if sigma < 0.3:
+        return draws.normal(name, like.shape[1], 6)
+    pad = int(4 * sigma) + 1
+    smooth = _blurred(draws.normal(name, like.shape[1] + 2 * pad, 6), sigma)[:, pad:-pad]
+    # A Gaussian kernel of width σ leaves white noise the variance 1 / (2 √π σ).
+    return smooth * math.sqrt(2 * math.sqrt(math.pi) * sigma)
+
+
+def _blurred(value: Float[Tensor, "batch time axis"], sigma: float) -> Float[Tensor, "batch time axis"]:
+    """Values smoothed by a Gaussian kernel of `sigma` frames; ends are repeated."""
+    reach = int(4 * sigma + 0.5)
+    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, device=value.device) / sigma).square())
+    flat = F.pad(value.mT, (reach, reach), mode="replicate").flatten(0, 1)[:, None]
+    return F.conv1d(flat, (kernel / kernel.sum())[None, None])[:, 0].unflatten(0, (len(value), -1)).mT
 
 
 class _Watches(NamedTuple):
-    R: Float[Tensor, "time wrist 3 3"]
-    acc: Float[Tensor, "time wrist 3"]
+    R: Float[Tensor, "batch time wrist 3 3"]
+    acc: Float[Tensor, "batch time wrist 3"]
     fps: float
+    draws: Draws
 
 
-_WatchError = Callable[[_Watches, float, torch.Generator], _Watches]
+_WatchError = Callable[[_Watches, float], _Watches]
 
 
-def _worn(window: Window, errors: tuple[tuple[_WatchError, float], ...], generator: torch.Generator) -> Window:
+def _worn(batch: Batch, errors: tuple[tuple[_WatchError, float], ...]) -> Batch:
     """With errors of watches, each of its size; without watches as it is."""
-    values = window.values
-    if "acc_world_wrist" not in values:
-        return window
-    watches = _Watches(values["R_world_wrist"], values["acc_world_wrist"], window.fps)
+    if "acc_world_wrist" not in batch.values or not any(size for _, size in errors):
+        return batch
+    watches = _Watches(batch.values["R_world_wrist"], batch.values["acc_world_wrist"], batch.fps, batch.draws)
     for error, size in errors:
         if size:
-            watches = error(watches, size, generator)
-    return window.changed(R_world_wrist=watches.R, acc_world_wrist=watches.acc)
+            watches = error(watches, size)
+    return batch.changed(R_world_wrist=watches.R, acc_world_wrist=watches.acc)
 
 
-def _slack(watches: _Watches, play_deg: float, generator: torch.Generator) -> _Watches:
+def _slack(watches: _Watches, play_deg: float) -> _Watches:
     """On straps that give under the arms' acceleration (as in `sensors.imu.synthesize_imu`)."""
-    sideways, axis = torch.nn.functional.normalize(torch.randn(2, 2, 3, generator=generator), dim=-1)
-    pushed = ((watches.R.mT @ watches.acc[..., None])[..., 0] * sideways).sum(-1, keepdim=True)
+    sideways, axis = F.normalize(watches.draws.normal("strap", 2, 1, 2, 3), dim=-1).unbind(1)
+    pushed = (_applied(watches.R.mT, watches.acc) * sideways).sum(-1, keepdim=True)
     gives = math.radians(play_deg) * torch.tanh(pushed / PUSHED) * axis
     return watches._replace(R=watches.R @ rotation.exp(gives))
 
 
-def _delayed(watches: _Watches, delay_s: float, generator: torch.Generator) -> _Watches:
+def _delayed(watches: _Watches, delay_s: float) -> _Watches:
     """Late or early; before the first frame and after the last one they repeat these."""
-    R, acc, fps = watches
-    count, wrist = len(R), torch.arange(2)
-    place = torch.arange(count)[:, None] - delay_s * fps * torch.randn(2, generator=generator)
-    place = place.clamp(0, count - 1)
+    R, acc, fps, draws = watches
+    count = R.shape[1]
+    late = delay_s * fps * draws.normal("watch delay", 1, 2)
+    place = (torch.arange(count, device=R.device)[:, None] - late).clamp(0, count - 1)
     low = place.long()
     high, share = (low + 1).clamp_max(count - 1), (place - low)[..., None]
-    acc = torch.lerp(acc[low, wrist], acc[high, wrist], share)
-    R = torch.lerp(R[low, wrist], R[high, wrist], share[..., None])
-    return _Watches(rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(R)), acc, fps)
+
+    def between(value: Tensor) -> Tensor:
+        flat = value.flatten(3)
+        rows = (each[..., None].expand_as(flat) for each in (low, high))
+        return torch.lerp(*(flat.gather(1, row) for row in rows), share).reshape(value.shape)
+
+    turned = rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(between(R)))
+    return watches._replace(R=turned, acc=between(acc))
 
 
-def _tilted(watches: _Watches, tilt_deg: float, generator: torch.Generator) -> _Watches:
+def _tilted(watches: _Watches, tilt_deg: float) -> _Watches:
     """With a gravity that is off, and does not cancel in their free acceleration."""
-    angle = math.radians(tilt_deg) * torch.randn(2, 3, generator=generator)
-    turn = rotation.exp(angle * torch.tensor([1.0, 1.0, 0.0]))
-    gravity = torch.tensor([0.0, 0.0, GRAVITY])
-    acc = (turn @ (watches.acc + gravity)[..., None])[..., 0] - gravity
+    lean = math.radians(tilt_deg) * watches.draws.normal("watch tilt", 1, 2, 2)
+    turn = rotation.exp(F.pad(lean, (0, 1)))
+    # The difference that a turned gravity makes to the specific force g e_z.
+    acc = _applied(turn, watches.acc) + GRAVITY * (turn[..., 2] - _up(turn))
     return watches._replace(R=turn @ watches.R, acc=acc)
 
 
-def _biased(watches: _Watches, bias_m_s2: float, generator: torch.Generator) -> _Watches:
+def _up(like: Tensor) -> Float[Tensor, "3"]:
+    return torch.eye(3, device=like.device, dtype=like.dtype)[2]
+
+
+def _biased(watches: _Watches, bias_m_s2: float) -> _Watches:
     """With a constant error of their accelerations, in their own axes."""
-    bias = bias_m_s2 * torch.randn(2, 3, 1, generator=generator)
-    return watches._replace(acc=watches.acc + (watches.R @ bias)[..., 0])
+    bias = bias_m_s2 * watches.draws.normal("watch bias", 1, 2, 3)
+    return watches._replace(acc=watches.acc + _applied(watches.R, bias))
 
 
-def _silenced(watches: _Watches, share: float, generator: torch.Generator) -> _Watches:
+def _silenced(watches: _Watches, share: float) -> _Watches:
     """Silent for `MAX_GAP_S` or longer; shorter gaps are interpolated (`DropFrames`)."""
-    R, acc, fps = watches
-    happens, begins, lasts = torch.rand(3, 2, generator=generator)
-    frame, last = torch.arange(len(R))[:, None], (len(R) * begins).long()
-    silent = (happens < share) & (frame > last) & (frame <= last + (MAX_GAP_S * fps + len(R) * lasts).long())
-    R = torch.where(silent[..., None, None], R[last, torch.arange(2)], R)
-    return _Watches(R, acc.masked_fill(silent[..., None], 0), fps)
+    R, acc, fps, draws = watches
+    count = R.shape[1]
+    happens, begins, lasts = draws.uniform("watch silence", 3, 1, 2).unbind(1)
+    frame, last = torch.arange(count, device=R.device)[:, None], (count * begins).long()
+    silent = (happens < share) & (frame > last) & (frame <= last + (MAX_GAP_S * fps + count * lasts).long())
+    still = R.gather(1, last[..., None, None].expand(-1, -1, -1, 3, 3))
+    return watches._replace(R=torch.where(silent[..., None, None], still, R), acc=acc.masked_fill(silent[..., None], 0))
 
 
-def mirrored(window: Window) -> Window:
-    """The window mirrored left to right."""
-    flip = torch.tensor(MIRROR)
+def turned(batch: Batch, angle: Float[Tensor, "batch"]) -> Batch:
+    """The batch with each window's world turned about its vertical by an angle (rad)."""
+    R = rotation.about_axis("z", angle)[:, None]
     changed = {}
-    for name, value in window.values.items():
-        twins = window.twins.get(name)
-        if twins is not None:
-            value = value[twins] if name == "t_parent_joint" else value[:, twins]
-        kind = name.split("_")[0]
-        if kind == "R":
-            value = value * torch.outer(flip, flip)
-        elif kind in ("t", "vel", "acc"):
-            value = value * flip
-        changed[name] = value
-    return replace(window, values=changed, mirrored=not window.mirrored)
+    for name, value in batch.values.items():
+        if "_world_" in name:
+            turn = R.reshape(-1, *[1] * (value.ndim - 3), 3, 3) if name[0] == "R" else R
+            flat = value if name[0] == "R" else value.flatten(1, -2)
+            changed[name] = turn @ flat if name[0] == "R" else (flat @ R[:, 0].mT).reshape(value.shape)
+    if (local := batch.values.get("R_parent_joint")) is not None:
+        local[:, :, 0] = R @ local[:, :, 0]  # the root's alone: other joints' turn with it
+    return batch.changed(**changed)
 
 
-def turned(window: Window, angle: float) -> Window:
-    """The window with the world turned about its vertical by an angle (rad)."""
-    R = rotation.about_axis("z", torch.tensor(angle))
+def scaled(batch: Batch, factor: Float[Tensor, "batch"]) -> Batch:
+    """The batch with wearers and worlds scaled by factors."""
     changed = {
-        name: R @ value if name.startswith("R") else value @ R.mT
-        for name, value in window.values.items()
-        if "_world_" in name
+        name: value * factor.reshape(-1, *[1] * (value.ndim - 1))
+        for name, value in batch.values.items()
+        if name.split("_")[0] in _LENGTHS
     }
-    if (local := window.values.get("R_parent_joint")) is not None:
-        changed["R_parent_joint"] = torch.cat([(R @ local[:, 0])[:, None], local[:, 1:]], 1)
-    return window.changed(**changed)
-
-
-def scaled(window: Window, factor: float) -> Window:
-    """The window with wearer and world scaled by a factor."""
-    lengths = {name: value for name, value in window.values.items() if name.split("_")[0] in _LENGTHS}
-    changed = window.changed(**{name: value * factor for name, value in lengths.items()})
-    return replace(changed, scale=window.scale * factor)
+    scale = factor if batch.scale is None else batch.scale * factor
+    return replace(batch.changed(**changed), scale=scale)
 
 
 def mirrored_rotations(

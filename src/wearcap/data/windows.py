@@ -1,7 +1,7 @@
-"""Windows of recordings for training; content and order are functions of seed and step.
+"""Windows of recordings for training, drawn in batches; content and order are functions of seed and step.
 
-A `Windows` data set cuts windows out of the recordings of stores. A system's `Content` says what is read of them and what
-a batch holds; the augmentations of `transforms.py` stand between the two. Mean and scale of features over a training
+A `Windows` data set packs the recordings of stores. A system's `Content` says what is kept of them and what a batch
+holds; the augmentations of `transforms.py` stand between the two. Mean and scale of features over a training
 split are computed of windows drawn from it, and saved with the weights.
 """
 
@@ -9,24 +9,29 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
+from rich.progress import track as progress
 from torch import Tensor
-from torch.utils.data import Dataset, Sampler
 
 from wearcap.data.arm_mixing import ArmDonors
-from wearcap.data.bodies import OtherBodies, OtherPerson
-from wearcap.data.transforms import Cut, Draws, TimeStretch, TimeTransform, Transform, Window
+from wearcap.data.batch import Batch, Transform
+from wearcap.data.bodies import OtherBodies
+from wearcap.data.draws import Draws
+from wearcap.data.packing import Packed, Track, forget_old, kept_track
+from wearcap.data.transforms import Cutting, TimeStretch
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
+from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
-
-W = TypeVar("W", bound=tuple)
+from wearcap.runtime.stages import code_digest, digest
 
 MIN_SCALE = 0.05
 """Smallest standard deviation that features are divided by: rotations that hardly vary would become mostly noise."""
+ARM_VERSIONS = 3
+"""Number of tracks of a recording with the arms of others (`OtherBodies.arms`)."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +47,22 @@ class Source:
 class Content:
     """What the windows of a system are made of; each system has its own."""
 
-    draws: ClassVar[tuple[str, ...]] = ()
-    """Names of the uniform numbers that are drawn first for every sample, in this order (`Draws`)."""
     requires: ClassVar[str] = ""
     """What usable recordings have, as the end of the message when none is (" with points")."""
     any_body: ClassVar[bool] = False
-    """Whether `open` can give a motion to people of other proportions."""
-    tracks_at_once: ClassVar[int | None] = None
-    """Number of tracks that are kept in memory; None: all."""
+    """Whether people of other proportions can do a motion."""
+    own_rate: ClassVar[bool] = False
+    """Whether a track has the rate of the windows, not the recording's."""
+    sensed: ClassVar[frozenset[str]] = frozenset()
+    parts: ClassVar[frozenset[str]] = frozenset()
+    jumps: ClassVar[dict[str, str]] = {}
+    """See `Batch`."""
 
     def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
         """Make or check what reading the recordings of a split needs."""
+
+    def settings(self) -> Any:
+        """What decides, beside the code, what is kept of a recording."""
 
     def usable(self, store: RecordingStore, name: str) -> bool:
         """Whether windows are cut out of a recording."""
@@ -62,38 +72,24 @@ class Content:
         """Fewest frames of a recording, at the rate of the windows, of which up to `stretch` times as many are read."""
         return window
 
-    def cut(self, track: Any, start: int, frames: int, every: int, windows: "Windows") -> Cut:
-        """The cut of an unchanged window, in frames of the track; `start` and `frames` are the recording's."""
-        stride = windows.stride * every
-        return Cut(start, windows.window, frames, stride=stride, step=every, stretch=windows.stretch)
+    def twins(self, file: RecordingFile) -> dict[str, list[int]]:
+        """What a mirror exchanges, by names of values (`Batch.twins`)."""
+        return {}
 
-    def varied(self, store: RecordingStore, name: str) -> bool:
-        """Whether a recording's motion can be given to people of other proportions: if no objects are handled."""
-        keys = open_recording(store.path_of(name)).keys
-        return self.any_body and not any(key.startswith("object_motion.") for key in keys)
+    def track(self, store: RecordingStore, name: str, recording: Recording, every: int) -> Track:
+        """What is kept of a recording; of its frames, those of a content of `own_rate` only every `every`-th.
 
-    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> Any:
-        """The track of a recording: what is kept of it in memory, for `read` to cut windows out of.
-
-        `person`: somebody else who does the same, for recordings that are `varied`; None: as recorded.
+        Values of `parts` have an axis of the body's parts before their last one.
         """
         raise NotImplementedError
 
-    def read(self, track: Any, cut: Cut, random: Draws) -> Window:
-        """The values of a window."""
-        raise NotImplementedError
-
-    def item(self, track: Any, cut: Cut, window: Window, random: Draws) -> tuple[Tensor, ...]:
-        """The batch item (a named tuple) of a transformed window."""
+    def batch(self, batch: Batch) -> tuple[Tensor, ...]:
+        """What a training step takes (a named tuple) of windows that were read and transformed."""
         raise NotImplementedError
 
 
-class Windows(Dataset):
-    """Windows of one split of one or more data sets, indexed by (window, seed).
-
-    An index without a seed comes from Lightning's overfit_batches, which replaces the sampler: the index is the seed.
-    Recordings are opened at their first use and kept in memory, in every process.
-    """
+class Windows:
+    """Windows of one split of one or more data sets, drawn in batches on the device that holds the recordings."""
 
     def __init__(
         self,
@@ -108,99 +104,169 @@ class Windows(Dataset):
         every: int | None = 1,
         balance: float = 1.0,
         bodies: OtherBodies | None = None,
-        transforms: dict[str, TimeTransform | Transform | None] | None = None,
+        transforms: dict[str, Cutting | Transform | None] | None = None,
     ):
         """Windows of `window` frames at `fps` that begin `stride` frames apart; `every`-th frames of recordings are used.
 
         `every` None takes recordings at any multiple of `fps`. `transforms` by name apply to `augmented` windows, those
-        of time first, each group in its order. In training a recording is drawn in proportion to its number of windows
+        of frames first, each group in its order. In training a recording is drawn in proportion to its number of windows
         to the power of `balance`: 1 samples all windows equally, 0 all recordings. `bodies` do the motion of `augmented`
-        windows in turn with the wearer, where the content is `varied`. Raises WearcapError for a recording
+        windows in turn with the wearer, where nothing is handled. Raises WearcapError for a recording
         at another rate, and when there are no windows.
         """
         self.content, self.window, self.stride, self.fps = content, window, stride, fps
-        chosen = [each for each in (transforms or {}).values() if each is not None] if augmented else []
-        self.in_time = tuple(each for each in chosen if isinstance(each, TimeTransform))
-        self.in_space = tuple(each for each in chosen if not isinstance(each, TimeTransform))
-        self.stretch = max((each.factor for each in self.in_time if isinstance(each, TimeStretch)), default=1.0)
-        self.recordings: list[tuple[RecordingStore, str, int]] = []
-        self._varied: list[bool] = []
-        self.bodies = bodies if augmented else None
-        self._tracks: dict[tuple[int, int], Any] = {}
-        self._donors: dict[Path, ArmDonors] = {}
+        self.bodies = bodies if augmented and content.any_body else None
+        chosen = [each for each in (self.bodies, *(transforms or {}).values()) if each is not None] if augmented else []
+        self.cutting = [each for each in chosen if isinstance(each, Cutting)]
+        self.changing = [each for each in chosen if callable(each)]
+        stretch = max((each.factor for each in chosen if isinstance(each, TimeStretch)), default=1.0)
         stores = [RecordingStore.open(source.root) for source in sources]
         content.prepare(stores, split)
-        least, starts, weights = content.min_frames(window, self.stretch), [], []
+        least, rows, found = content.min_frames(window, stretch), [], list[_Chosen]()
         for source, store in zip(sources, stores):
-            rate, found = _rows(store, split, fps, every)
-            rows = [(name, frames) for name, frames in found if frames >= least * rate]
-            counts = [max(0, frames - window * rate) // (stride * rate) + 1 for _, frames in rows]
+            rate, entries = _rows(store, split, fps, every)
+            entries = [(name, frames) for name, frames in entries if frames >= least * rate]
+            counts = [max(0, frames - window * rate) // (stride * rate) + 1 for _, frames in entries]
             power = balance if split == "train" else 1.0
             total = sum(count**power for count in counts)
-            for (name, frames), count in zip(rows, counts):
+            for (name, _), count in zip(entries, counts):
                 if content.usable(store, name):
-                    starts += [(len(self.recordings), k * stride * rate, frames) for k in range(count)]
-                    weights += [source.weight * count ** (power - 1) / total] * count
-                self.recordings.append((store, name, rate))
-                self._varied.append(source.bodies)
-        if not starts:
+                    step = 1 if content.own_rate else rate
+                    rows += [(len(found), k * stride * step, step) for k in range(count)]
+                    weight = source.weight * count ** (power - 1) / total
+                    found.append(_Chosen(store, name, rate, source.bodies, count, weight))
+        if not rows:
             what = f"no windows in split {split!r}"
             expected = f"recordings of at least {least} frames{content.requires}"
             raise WearcapError(what, where=", ".join(source.root for source in sources), expected=expected)
-        self.starts, self.weights = torch.tensor(starts), torch.tensor(weights, dtype=torch.float64)
+        if len(steps := {each.rate for each in found}) > 1 and not content.own_rate:
+            raise WearcapError(f"recordings of {sorted(steps)} frames per frame of a window", expected="one rate")
+        self.starts, self.step = torch.tensor(rows)[:, :2], rows[0][2]
+        self.weights = torch.tensor([each.weight for each in found for _ in range(each.count)], dtype=torch.float64)
+        self._pack(found)
+
+    def _pack(self, found: Sequence["_Chosen"]) -> None:
+        """Keep the recordings' tracks, and those of people who move others' arms."""
+        made = [(each, 0) for each in found]
+        varied = [self.bodies is not None and each.bodies and not _handled(each.file) for each in found]
+        versions = torch.arange(len(found))[:, None]
+        if self.bodies is not None and self.bodies.arms and any(varied):
+            versions = versions.repeat(1, ARM_VERSIONS)
+            mixed = torch.tensor(varied).nonzero()[:, 0]
+            versions[mixed] = len(found) + torch.arange(len(mixed) * ARM_VERSIONS).reshape(-1, ARM_VERSIONS)
+            made += [(found[each], version) for each in mixed.tolist() for version in range(1, ARM_VERSIONS + 1)]
+        kept = _Kept(self.content, [each for each, free in zip(found, varied) if free])
+        tracks = [kept(*each) for each in progress(made, "packing recordings", transient=True, disable=len(made) < 8)]
+        for root in {each.store.root for each in found}:
+            forget_old(root)
+        if self.bodies is None:
+            tracks = [_of_wearer(track, self.content.parts) for track in tracks]
+        self.packed = Packed(tracks, [each.name for each, _ in made])
+        self.varied, self.versions = torch.tensor(varied), versions
+        twins = self.content.twins(found[0].file)
+        self.twins = {name: torch.tensor(order) for name, order in twins.items()}
 
     def __len__(self) -> int:
         return len(self.starts)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_tracks": {}, "_donors": {}}
+    def to(self, device: torch.device) -> "Windows":
+        """Draw on a device, which then holds all recordings."""
+        self.packed.to(device)
+        self.twins = {name: order.to(device) for name, order in self.twins.items()}
+        self.starts, self.weights = self.starts.to(device), self.weights.to(device)
+        self.varied, self.versions = self.varied.to(device), self.versions.to(device)
+        return self
 
-    def track(self, number: int, person: int = 0) -> Any:
-        """A whole recording, by its index in `recordings`, of its wearer (0) or of one of the other `bodies`."""
-        if (number, person) not in self._tracks:
-            if len(self._tracks) == self.content.tracks_at_once:
-                self._tracks.pop(next(iter(self._tracks)))
-            self._tracks[number, person] = self.content.open(*self.recordings[number], self._other(number, person))
-        return self._tracks[number, person]
+    def cut(self, index: Int64[Tensor, "batch"], seed: Int64[Tensor, "batch"]) -> Batch:
+        """The frames of windows by their numbers, each augmented by its seed."""
+        track, start = self.starts[index].unbind(1)
+        content = self.content
+        batch = Batch(
+            self.packed,
+            Draws(seed),
+            track,
+            start,
+            self.window,
+            self.fps,
+            stride=self.stride * self.step,
+            step=self.step,
+            twins=self.twins,
+            sensed=content.sensed,
+            jumps=content.jumps,
+            varied=self.varied[track],
+            versions=self.versions[track],
+            parts=content.parts if self.bodies is not None else frozenset(),
+        )
+        for transform in self.cutting:
+            batch = transform.cut(batch)
+        return batch
 
-    def _other(self, number: int, person: int) -> OtherPerson | None:
-        """One of the other `bodies` who does a recording's motion; None for its wearer."""
-        if self.bodies is None or not person:
-            return None
-        seed = 1_000_003 * number + person
-        donors = self._arm_donors(self.recordings[number][0]) if self.bodies.moves_other_arms(seed) else None
-        return OtherPerson(self.bodies.proportions(seed), seed, donors)
+    def batch(self, index: Int64[Tensor, "batch"], seed: Int64[Tensor, "batch"]) -> Any:
+        """Windows by their numbers, each augmented by its seed, as the system's training takes them."""
+        batch = self.cut(index, seed).read()
+        for transform in self.changing:
+            batch = transform(batch)
+        return self.content.batch(batch)
 
-    def _arm_donors(self, store: RecordingStore) -> ArmDonors:
-        """The recordings of a store that windows are cut out of and in which no objects are handled."""
-        if store.root not in self._donors:
-            cut = {
-                self.recordings[number][1]
-                for number in self.starts[:, 0].unique().tolist()
-                if self.recordings[number][0].root == store.root
-            }
-            names = [name for name in sorted(cut) if self.content.varied(store, name)]
-            self._donors[store.root] = ArmDonors([open_recording(store.path_of(name)) for name in names])
-        return self._donors[store.root]
 
-    def _person(self, number: int, seed: int) -> int:
-        """Who does the motion of a sample."""
-        if self.bodies is None or not self._varied[number] or not self.content.varied(*self.recordings[number][:2]):
-            return 0
-        return seed % (self.bodies.count + 1)
+@dataclass(frozen=True)
+class _Chosen:
+    """A recording of which windows are cut, with their number and their weight in the draws."""
 
-    def __getitem__(self, item: tuple[int, int] | int) -> tuple[Tensor, ...]:
-        index, seed = item if isinstance(item, tuple) else (item, item)
-        number, start, frames = self.starts[index].tolist()
-        random = Draws(seed, self.content.draws)
-        track = self.track(number, self._person(number, seed))
-        cut = self.content.cut(track, start, frames, self.recordings[number][2], self)
-        for transform in self.in_time:
-            cut = transform.retimed(cut, random)
-        window = replace(self.content.read(track, cut, random), fps=self.fps)
-        for transform in self.in_space:
-            window = transform(window, random)
-        return self.content.item(track, cut, window, random)
+    store: RecordingStore
+    name: str
+    rate: int
+    bodies: bool
+    count: int
+    weight: float
+
+    @property
+    def file(self) -> RecordingFile:
+        return RecordingFile(self.store.path_of(self.name))
+
+
+class _Kept:
+    """Makes the tracks of recordings, or takes them from their data sets' caches."""
+
+    def __init__(self, content: Content, donors: list[_Chosen]):
+        """`donors`: recordings whose arms others may move, in their own data set."""
+        self.content, self.donors = content, donors
+        modules = [each.__module__ for each in type(content).__mro__ if each.__module__.startswith("wearcap.")]
+        self.key = digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
+        self._arms = cache(self._arms_in)
+
+    def __call__(self, each: _Chosen, version: int) -> Track:
+        entries = each.store.entries
+        name = f"{entries[each.name].sha256[:32]}-{each.rate}"
+        if version:
+            others = [entries[other.name].sha256 for other in self.donors if other.store.root == each.store.root]
+            name += f"-{version}-{digest(others)[:16]}"
+        return kept_track(each.store.root, self.key, name, lambda: self._made(each, version))
+
+    def _made(self, each: _Chosen, version: int) -> Track:
+        recording = each.file.load()
+        if version and recording.motion is not None:
+            seed = int(each.store.entries[each.name].sha256[:8], 16) + version
+            mixed = self._arms(each.store.root).mixed(recording.motion, each.file, seed)
+            recording = replace(recording, motion=mixed)
+        return self.content.track(each.store, each.name, recording, each.rate)
+
+    def _arms_in(self, root: Path) -> ArmDonors:
+        return ArmDonors([each.file for each in self.donors if each.store.root == root])
+
+
+def _of_wearer(track: Track, parts: frozenset[str]) -> Track:
+    """A track with sums over the body's parts."""
+    values, constants = (
+        {name: value.sum(-2) if name in parts else value for name, value in each.items()}
+        for each in (track.values, track.constants)
+    )
+    return Track(values, constants, track.tables)
+
+
+def _handled(file: RecordingFile) -> bool:
+    """Whether objects are handled in a recording, which other arms would not reach."""
+    return any(key.startswith("object_motion.") for key in file.keys)
 
 
 def _rows(store: RecordingStore, split: str, fps: float, every: int | None) -> tuple[int, list[tuple[str, int]]]:
@@ -225,64 +291,17 @@ def _rows(store: RecordingStore, split: str, fps: float, every: int | None) -> t
     return every, [(name, entry.frames) for name, entry in zip(store.names(split), entries)]
 
 
-@cache
-def open_recording(path: Path) -> RecordingFile:
-    """A recording's file, which stays open per process, so that a window reads its own bytes only."""
-    return RecordingFile(path)
-
-
-class SeededSampler(Sampler):
-    """Weighted random samples of (window, seed), for epochs of a fixed number of steps.
-
-    The sample at a step depends on seed, epoch and position alone: a resumed run continues with the same samples, and
-    the ranks of a distributed run split one sequence.
-    """
-
-    def __init__(self, weights: Tensor, count: int, seed: int, rank: int = 0, world: int = 1):
-        self.weights, self.count, self.seed = weights, count, seed
-        self.rank, self.world, self.epoch = rank, world, 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Called by Lightning at the start of every epoch."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        return self.count // self.world
-
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        random = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
-        windows = torch.multinomial(self.weights, self.count, replacement=True, generator=random)
-        seeds = torch.randint(2**62, (self.count,), generator=random)
-        usable = slice(self.rank, self.count - self.count % self.world, self.world)
-        yield from zip(windows[usable].tolist(), seeds[usable].tolist())
-
-
-class FixedSampler(Sampler):
-    """Evenly spread windows with fixed seeds, so that every validation uses the same noise."""
-
-    def __init__(self, windows: int, limit: int | None = None):
-        count = min(windows, limit or windows)
-        self.items = [(k * windows // count, k) for k in range(count)]
-
-    def __len__(self) -> int:
-        return len(self.items)
-
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        return iter(self.items)
-
-
-def collate(windows: Sequence[W]) -> W:
-    """Stacks windows (named tuples of tensors) along a leading batch axis."""
-    return type(windows[0])(*(torch.stack(field) for field in zip(*windows)))
-
-
 def drawn_batches(dataset: Any, limit: int, size: int | None = None) -> Iterator[Any]:
     """Batches of `size` (default: one batch) of `limit` windows, drawn by the data set's weights from a fixed seed."""
-    random = torch.Generator().manual_seed(0)
-    drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
-    items, size = [*zip(drawn, range(limit))], size or limit
-    for first in range(0, limit, size):
-        yield collate([dataset[item] for item in items[first : first + size]])
+    numbers = torch.arange(limit, device=dataset.weights.device)
+    for part in numbers.split(size or limit):
+        yield dataset.batch(drawn(dataset.weights.cumsum(0), part), part)
+
+
+def drawn(upto: Float[Tensor, "window"], numbers: Int64[Tensor, "batch"]) -> Int64[Tensor, "batch"]:
+    """Windows of the draws of some numbers, by the sums of weights up to each window."""
+    place = Draws(numbers).share("window") * upto[-1]
+    return torch.searchsorted(upto, place, right=True).clamp_max(len(upto) - 1)
 
 
 def standardize(normalizer: Normalizer, rows: Float[Tensor, "*batch feature"], min_scale: float = MIN_SCALE) -> None:

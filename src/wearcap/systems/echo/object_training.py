@@ -12,9 +12,9 @@ from einops import rearrange, reduce, repeat
 from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn import functional as F
-from torch.utils.data import Dataset
 
 from wearcap.boundary.tensors import read_tensors, write_tensors
+from wearcap.data.draws import Draws
 from wearcap.data.objects import POINTS
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
@@ -27,10 +27,10 @@ _TEMPERATURE = 0.1
 
 
 class _ObjectViews(NamedTuple):
-    """Augmented views of one object's point cloud (m), or a batch of objects (a leading "batch" axis)."""
+    """Augmented views of the point clouds (m) of a batch of objects."""
 
-    points: Float[Tensor, "*batch view point 3"]
-    label: Int64[Tensor, "*batch"]
+    points: Float[Tensor, "batch view point 3"]
+    label: Int64[Tensor, "batch"]
 
 
 @dataclass(frozen=True)
@@ -46,31 +46,27 @@ class CloudAugmentation:
     turned: float = 0.5
     """Share of views with a uniformly random rotation; the others are rotated about the vertical axis."""
 
-    def __call__(self, points: Float[Tensor, "point 3"], random: torch.Generator) -> Float[Tensor, "point 3"]:
-        """An augmented cloud (m); all randomness comes from the generator."""
-        points = points * (1 + self.stretch * (2 * torch.rand(3, generator=random) - 1))
-        points = points + self.jitter_m * torch.randn(points.shape, generator=random)
-        any_way, angle, share = torch.rand(3, generator=random).tolist()
-        about_up = rotation.about_axis("z", torch.tensor(2 * torch.pi * angle))
-        points = points @ (random_rotation(random) if any_way < self.turned else about_up).T
-        kept = max(1, int((self.least_kept + (1 - self.least_kept) * share) * len(points)))
-        order = torch.randperm(len(points), generator=random)
-        repeats = torch.randint(kept, (len(points) - kept,), generator=random)
-        return points[order[torch.cat([torch.arange(kept), repeats])]]
+    def __call__(
+        self, points: Float[Tensor, "batch point 3"], draws: Draws, view: str
+    ) -> Float[Tensor, "batch point 3"]:
+        """Augmented clouds (m); all randomness comes from the draws of a view."""
+        batch, count, _ = points.shape
+        points = points * (1 + self.stretch * (2 * draws.uniform(f"{view} stretch", 1, 3) - 1))
+        points = points + self.jitter_m * draws.normal(f"{view} jitter", count, 3)
+        any_way, angle, share = draws.uniform(f"{view} turn", 3).unbind(1)
+        about_up = rotation.about_axis("z", 2 * torch.pi * angle)
+        anyhow = rotation.matrix_from_quat_wxyz(draws.normal(f"{view} rotation", 4))  # uniform over all rotations
+        points = points @ torch.where((any_way < self.turned)[:, None, None], anyhow, about_up).mT
+        kept = ((self.least_kept + (1 - self.least_kept) * share) * count).long().clamp_min(1)[:, None]
+        order = draws.uniform(f"{view} order", count).argsort(1)
+        repeats = (draws.uniform(f"{view} repeats", count) * kept).long()
+        place = torch.arange(count, device=points.device).expand(batch, -1)
+        chosen = order.gather(1, torch.where(place < kept, place, repeats))
+        return points.gather(1, chosen[..., None].expand(-1, -1, 3))
 
 
-def random_rotation(random: torch.Generator) -> Float[Tensor, "3 3"]:
-    """A uniformly random rotation: Q of a Gaussian matrix's QR decomposition, made right-handed."""
-    q, r = torch.linalg.qr(torch.randn(3, 3, generator=random))
-    R = q * r.diagonal().sign()
-    return R * R.det().sign()
-
-
-class ObjectClouds(Dataset):
-    """Two views of each generated object: both augmented in training, else one original and one augmented.
-
-    An item's index is (object, seed), or the object alone.
-    """
+class ObjectClouds:
+    """Two views of each generated object: both augmented in training, else one original and one augmented."""
 
     def __init__(
         self,
@@ -106,11 +102,11 @@ class ObjectClouds(Dataset):
     def __len__(self) -> int:
         return len(self.labels)
 
-    def __getitem__(self, item: tuple[int, int] | int) -> _ObjectViews:
-        index, seed = item if isinstance(item, tuple) else (item, item)
-        random, cloud = torch.Generator().manual_seed(seed), self.clouds[index]
-        first = self.augmentation(cloud, random) if self.augmented else cloud
-        return _ObjectViews(torch.stack([first, self.augmentation(cloud, random)]), self.labels[index])
+    def batch(self, index: Int64[Tensor, "batch"], seed: Int64[Tensor, "batch"]) -> _ObjectViews:
+        """Objects by their numbers, each augmented by its seed."""
+        draws, clouds = Draws(seed), self.clouds[index]
+        first = self.augmentation(clouds, draws, "first") if self.augmented else clouds
+        return _ObjectViews(torch.stack([first, self.augmentation(clouds, draws, "second")], 1), self.labels[index])
 
 
 class ObjectEncoding(Training):

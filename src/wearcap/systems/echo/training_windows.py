@@ -1,21 +1,22 @@
 """Training windows for ECHO: three tracked points with ground-truth body, active object and contacts."""
 
-from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import TOUCH_M, contact_points
-from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
-from wearcap.data.bodies import OtherPerson
-from wearcap.data.features import body_size, on_level_ground
-from wearcap.data.transforms import Cut, Draws, Window, joint_twins
-from wearcap.data.windows import Content, Windows, open_recording
+from wearcap.body.contact_points import BODY_POINTS, TOUCH_M, contact_points
+from wearcap.body.skeleton import MIRROR
+from wearcap.data.batch import Batch
+from wearcap.data.bodies import bones_in_parts, head_in_parts, places_in_parts, size_in_parts
+from wearcap.data.features import on_level_ground
+from wearcap.data.packing import Track
+from wearcap.data.transforms import joint_twins
+from wearcap.data.windows import Content
 from wearcap.diffusion.levels import DRAWS
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -44,41 +45,43 @@ MIN_FRAMES = 6
 """Length of the shortest training window (frames)."""
 CANONICAL = "canonical", "canonical_mirrored"
 """Names of the objects' canonical poses, for windows as they are and for mirrored ones."""
+MOMENTS = 12
+"""Numbers of an object's mean and second moment."""
 ASKEW_DEG = 22.5
 """Angle between the wearer's heading and the orientation to which the canonical ones are nearest."""
 
 
 class EchoWindow(NamedTuple):
-    """One window, or a batch of them (a leading "batch" axis on every field); frames beyond the end are padding."""
+    """A batch of windows; frames beyond the end are padding."""
 
-    R_world_point: Float[Tensor, "*batch time point 3 3"]
-    t_world_point: Float[Tensor, "*batch time point 3"]
-    floor_height: Float[Tensor, "*batch time"]
-    size: Float[Tensor, "*batch limb"]
+    R_world_point: Float[Tensor, "batch time point 3 3"]
+    t_world_point: Float[Tensor, "batch time point 3"]
+    floor_height: Float[Tensor, "batch time"]
+    size: Float[Tensor, "batch limb"]
     """`body_size` of the wearer (m)."""
-    t_parent_joint: Float[Tensor, "*batch joint 3"]
-    R_parent_joint: Float[Tensor, "*batch time joint 3 3"]
-    t_world_root: Float[Tensor, "*batch time 3"]
-    contact: Float[Tensor, "*batch time contact"]
+    t_parent_joint: Float[Tensor, "batch joint 3"]
+    R_parent_joint: Float[Tensor, "batch time joint 3 3"]
+    t_world_root: Float[Tensor, "batch time 3"]
+    contact: Float[Tensor, "batch time contact"]
     """64 body points on the active object, then `FOOT_PATCHES` on the floor: 1 for contact."""
-    has_object: Bool[Tensor, "*batch time"]
+    has_object: Bool[Tensor, "batch time"]
     """Whether an object is active; otherwise object pose and body contacts are arbitrary."""
-    object_code: Float[Tensor, "*batch time code"]
+    object_code: Float[Tensor, "batch time code"]
     """Class, extents and feature of the active object (`ObjectShape.code`)."""
-    R_world_object: Float[Tensor, "*batch time 3 3"]
-    t_world_object: Float[Tensor, "*batch time 3"]
-    R_world_canonical: Float[Tensor, "*batch time 3 3"]
+    R_world_object: Float[Tensor, "batch time 3 3"]
+    t_world_object: Float[Tensor, "batch time 3"]
+    R_world_canonical: Float[Tensor, "batch time 3 3"]
     """The object's pose, or another that looks the same (`canonical`)."""
-    t_world_canonical: Float[Tensor, "*batch time 3"]
-    object_mean: Float[Tensor, "*batch time 3"]
-    object_spread: Float[Tensor, "*batch time 3 3"]
+    t_world_canonical: Float[Tensor, "batch time 3"]
+    object_mean: Float[Tensor, "batch time 3"]
+    object_spread: Float[Tensor, "batch time 3 3"]
     """Mean (m) of the object's points about its centre, and second moment (m²), which gives their mean squared
     displacement by a rotation."""
-    valid: Bool[Tensor, "*batch time"]
+    valid: Bool[Tensor, "batch time"]
     """False for padding."""
-    noise: Float[Tensor, "*batch time feature"]
-    level_draws: Float[Tensor, "*batch time 4"]
-    draws: Float[Tensor, "*batch draw"]
+    noise: Float[Tensor, "batch time feature"]
+    level_draws: Float[Tensor, "batch time 4"]
+    draws: Float[Tensor, "batch draw"]
     """Diffusion noise and uniform draws for noise levels: functions of seed and step, whatever the worker process."""
 
     @property
@@ -97,57 +100,75 @@ class EchoWindow(NamedTuple):
         return Rigid(self.R_world_object, self.t_world_object)
 
 
-@dataclass(frozen=True, eq=False)
-class EchoTrack:
-    """Conditioning and ground truth of a whole recording at the model's rate."""
+def echo_track(
+    recording: Recording, environment: Environment | None, reader: ObjectReader, every: int, within_m: float
+) -> Track:
+    """Every `every`-th frame of a recording with ground truth; contact is a distance of at most `within_m` (m).
 
-    points: ThreePoints
-    floor_height: Float[Tensor, "time"]
-    skeleton: Skeleton
-    size: Float[Tensor, "limb"]
-    body: Body
-    contact: Float[Tensor, "time contact"]
-    objects: list[ObjectShape]
+    The head is the measured one, or without a head stream of the motion's length the ground truth; wrists are true.
+    """
+    motion, head = recording.motion, recording.head
+    assert motion is not None
+    take = torch.arange(0, len(motion), every)
+    chosen = motion.skeleton.indices(*POINTS)
+    R_world_point, t_world_point = motion.T_world_joint.R[:, chosen], places_in_parts(motion, POINTS)
+    if head is not None and len(head.timestamps) == len(motion):
+        R_world_point[:, 0] = head.T_world_head.R
+        t_world_point[:, 0] = head_in_parts(motion, head.T_world_head.t)
+    found = _Objects.of(recording, environment, reader, take, within_m)
+    canonical_poses = [
+        canonical(found.pose, found.shapes, R_world_point[take, 0], found.touch.any(1), found.active, side)
+        for side in (1.0, -1.0)
+    ]
+    poses = dict(zip(("object", *CANONICAL), (found.pose, *canonical_poses)))
+    floor = torch.zeros(len(motion)) if recording.floor is None else recording.floor.height
+    values = {
+        "R_world_point": R_world_point[take],
+        "t_world_point": t_world_point[take],
+        "floor_height": floor[take].float(),
+        "R_parent_joint": motion.R_parent_joint[take],
+        "t_world_root": motion.t_world_root[take],
+        "contact": torch.cat([found.touch, foot_patches(recording)[take]], 1),
+        "object": found.active.int(),
+        **{f"{kind}_world_{name}": getattr(T, kind) for name, T in poses.items() for kind in "Rt"},
+    }
+    constants = {"t_parent_joint": bones_in_parts(motion.skeleton), "size": size_in_parts(motion.skeleton)}
+    rows = [_described(shape) for shape in found.shapes]
+    none = torch.zeros(0, 2, reader.features.object_condition_size + MOMENTS)
+    return Track(values, constants, {"object": torch.stack(rows) if rows else none})
+
+
+class _Objects(NamedTuple):
+    """A recording's objects, and at some of its frames the active one."""
+
+    shapes: list[ObjectShape]
     active: Int64[Tensor, "time"]
-    """Index of the active object in `objects`, -1 without one."""
-    T_world_object: Rigid
+    """Index of the active object in `shapes`, `NO_OBJECT` without one."""
+    pose: Rigid
     """Pose of the active object's centre; the identity without one."""
-    T_world_canonical: tuple[Rigid, Rigid]
-    """The same, or other poses that look the same (`canonical`): for the windows as they are, and for mirrored ones."""
-
-    @cached_property
-    def twins(self) -> dict[str, list[int]]:
-        """What a mirror exchanges: joints, wrists, points of the body, heels and toe tips."""
-        joints = joint_twins(self.skeleton)
-        points = {"R_world_point": TWIN_POINTS, "t_world_point": TWIN_POINTS}
-        return {"R_parent_joint": joints, "t_parent_joint": joints, "contact": TWIN_CONTACTS} | points
+    touch: Bool[Tensor, "time point"]
+    """Which points of the body touch it."""
 
     @classmethod
-    def read(
-        cls, recording: Recording, environment: Environment | None, reader: ObjectReader, every: int, within_m: float
-    ) -> "EchoTrack":
-        """Every `every`-th frame of a recording with ground truth; contact is a distance of at most `within_m` (m).
-
-        The head is the measured one, or without a head stream of the motion's length the ground truth; wrists are true.
-        """
-        motion, head = recording.motion, recording.head
+    def of(
+        cls,
+        recording: Recording,
+        environment: Environment | None,
+        reader: ObjectReader,
+        take: Int64[Tensor, "time"],
+        within_m: float,
+    ) -> "_Objects":
+        motion = recording.motion
         assert motion is not None
-        take = torch.arange(0, len(motion), every)
-        times, body = motion.timestamps[take], motion.T_world_joint
-        chosen = motion.skeleton.indices(*POINTS)
-        points = ThreePoints(body.R[take][:, chosen].clone(), body.t[take][:, chosen].clone())
-        if head is not None and len(head.timestamps) == len(motion):
-            T_world_head = head.T_world_head[take]
-            points.R_world_point[:, 0], points.t_world_point[:, 0] = T_world_head.R, T_world_head.t
         spans = true_spans(recording) if environment is not None and recording.object_motion else []
         names = list(dict.fromkeys(span.object for span in spans))
-        objects = [reader(environment.by_name(name)) for name in names] if environment is not None else []
+        shapes = [reader(environment.by_name(name)) for name in names] if environment is not None else []
         # The body's surface takes a quarter of a second, and is asked for where there is something to touch alone.
-        surface = contact_points(anny_body(motion.skeleton, recording.shape or None)) if objects else None
-        active = active_at(spans, names, times)
+        surface = contact_points(anny_body(motion.skeleton, recording.shape or None)) if shapes else None
+        active = active_at(spans, names, motion.timestamps[take])
         R, t = torch.eye(3).repeat(len(take), 1, 1), torch.zeros(len(take), 3)
-        contact = torch.zeros(len(take), CONTACTS)
-        for number, shape in enumerate(objects):
+        touch = torch.zeros(len(take), BODY_POINTS, dtype=torch.bool)
+        for number, shape in enumerate(shapes):
             rows = (active == number).nonzero()[:, 0]
             if not len(rows) or environment is None or surface is None:
                 continue
@@ -159,15 +180,19 @@ class EchoTrack:
                 T = track.T_world_body[take[rows]]
             T = shape.centred(T)
             R[rows], t[rows] = T.R, T.t
-            skin = surface.vertices(body[take[rows]])
-            contact[rows, : CONTACTS - len(FOOT_PATCHES)] = body_contact(skin, shape, T, within_m).float()
-        first = points.R_world_point[:, 0], (contact > 0).any(1), active
-        alike = [canonical(Rigid(R, t), objects, *first, side) for side in (1.0, -1.0)]
-        contact[:, CONTACTS - len(FOOT_PATCHES) :] = foot_patches(recording)[take].float()
-        floor = recording.floor.height[take] if recording.floor is not None else torch.zeros(len(take))
-        wearer = floor.float(), motion.skeleton, body_size(motion.skeleton)
-        truth = Body(motion.R_parent_joint[take], motion.t_world_root[take])
-        return cls(points, *wearer, truth, contact, objects, active, Rigid(R, t), (alike[0], alike[1]))
+            skin = surface.vertices(motion.T_world_joint[take[rows]])
+            touch[rows] = body_contact(skin, shape, T, within_m)
+        return cls(shapes, active, Rigid(R, t), touch)
+
+
+def _described(shape: ObjectShape) -> Float[Tensor, "side value"]:
+    """Code, mean and second moment of an object, as it is and mirrored along its own y axis."""
+    flip = torch.tensor(MIRROR)
+    mean, spread = shape.cloud.mean(0), shape.cloud.mT @ shape.cloud / len(shape.cloud)
+    own = torch.cat([shape.code, mean, spread.flatten()])
+    return torch.stack(
+        [own, torch.cat([shape.code_mirrored, mean * flip, (spread * torch.outer(flip, flip)).flatten()])]
+    )
 
 
 def canonical(
@@ -205,11 +230,13 @@ def canonical(
 class EchoContent(Content):
     """Windows of recordings whose frame rates are integer multiples of the model's.
 
-    Recordings without objects are of humans alone. Tracks are built at the first use of a recording and kept.
+    Recordings without objects are of humans alone.
     """
 
-    draws = ("shift", "mirror", "ends", "end")
-    any_body = True
+    any_body = own_rate = True
+    sensed = frozenset({*ThreePoints._fields, "floor_height"})
+    parts = frozenset({"t_world_point", "t_parent_joint", "size"})
+    jumps: ClassVar[dict[str, str]] = {f"{kind}_world_{name}": "object" for name in ("object", *CANONICAL) for kind in "Rt"}
 
     def __init__(
         self,
@@ -230,71 +257,53 @@ class EchoContent(Content):
         self.encoder = encoder
         self._reader = ObjectReader(features, self.encoder)
 
+    def settings(self) -> Any:
+        return self.features, self.encoder, self.within_m, self.objects
+
     def min_frames(self, window: int, stretch: float) -> int:
         return 2 * MIN_FRAMES
 
     def usable(self, store: RecordingStore, name: str) -> bool:
-        return on_level_ground(open_recording(store.path_of(name)))
+        return on_level_ground(RecordingFile(store.path_of(name)))
 
-    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> EchoTrack:
-        opened = RecordingFile(store.path_of(name))
-        recording = opened.load() if person is None else person.recording(opened)
+    def twins(self, file: RecordingFile) -> dict[str, list[int]]:
+        joints = joint_twins(file.part("motion").skeleton)
+        points = {"R_world_point": TWIN_POINTS, "t_world_point": TWIN_POINTS}
+        return {"R_parent_joint": joints, "t_parent_joint": joints, "contact": TWIN_CONTACTS} | points
+
+    def track(self, store: RecordingStore, name: str, recording: Recording, every: int) -> Track:
         file = recording.environment if self.objects else None
         environment = None if file is None else _environment(store.root / file)
-        return EchoTrack.read(recording, environment, self._reader, every, self.within_m)
+        return echo_track(recording, environment, self._reader, every, self.within_m)
 
-    def cut(self, track: EchoTrack, start: int, frames: int, every: int, windows: Windows) -> Cut:
-        latest = max(frames // every - windows.window, 0)
-        length = len(track.floor_height)
-        return Cut(start // every, windows.window, length, windows.stride, latest=latest, stretch=windows.stretch)
-
-    def read(self, track: EchoTrack, cut: Cut, random: Draws) -> Window:
-        poses = {"object": track.T_world_object, **dict(zip(CANONICAL, track.T_world_canonical))}
-        poses = {f"{kind}_world_{name}": getattr(T, kind) for name, T in poses.items() for kind in "Rt"}
-        true = track.body._asdict() | {"contact": track.contact} | poses
-        values = {name: cut.take(name, part) for name, part in true.items()}
-        low, high, _ = cut.between()
-        changes = track.active[low] != track.active[high]
-        for name in poses:
-            # Nothing is between the poses of two objects.
-            values[name][changes] = true[name][cut.frames[changes]]
-        sensed = track.points._asdict() | {"floor_height": track.floor_height}
-        values |= {name: cut.take(name, part, sensed=True) for name, part in sensed.items()}
-        values |= {"size": track.size, "t_parent_joint": track.skeleton.t_parent_joint}
-        return Window(values, track.twins)
-
-    def item(self, track: EchoTrack, cut: Cut, window: Window, random: Draws) -> EchoWindow:
-        """The window with its objects' codes and moments, and the numbers that its diffusion draws.
-
-        A mirrored object is mirrored along its own y axis, so that its pose stays a rotation.
-        """
-        active = track.active[cut.frames]
-        nothing = (torch.zeros(self.features.object_condition_size), torch.zeros(3), torch.zeros(3, 3))
-        shapes = [
-            (s.code_mirrored if window.mirrored else s.code, s.cloud.mean(0), s.cloud.mT @ s.cloud / len(s.cloud))
-            for s in track.objects
-        ]
-        code, mean, spread = (torch.stack(rows)[active] for rows in zip(*shapes, nothing))
-        if window.mirrored:
-            flip = torch.tensor(MIRROR)
-            mean, spread = mean * flip, spread * torch.outer(flip, flip)
-        if window.scale != 1:
-            code[:, len(self.features.classes) :][:, :EXTENTS] *= window.scale
-            mean, spread = mean * window.scale, spread * window.scale**2
-        features = self.features.human_size + OBJECT_SIZE + CONTACTS
-        chosen = CANONICAL[window.mirrored] if self.canonical else "object"
-        values = {name: value for name, value in window.values.items() if not name.endswith(CANONICAL)}
-        values |= {f"{kind}_world_canonical": window.values[f"{kind}_world_{chosen}"] for kind in "Rt"}
+    def batch(self, batch: Batch) -> EchoWindow:
+        """The windows with their objects' codes and moments, and the numbers that their diffusion draws."""
+        values, draws = dict(batch.values), batch.draws
+        row, flipped = values.pop("object"), batch.mirrored
+        side = torch.zeros_like(batch.track) if flipped is None else flipped.long()
+        described = batch.packed.tables["object"][row, side[:, None]]
+        code, mean, spread = described.split([described.shape[-1] - MOMENTS, 3, 9], -1)
+        spread = spread.unflatten(-1, (3, 3))
+        if (scale := batch.scale) is not None:
+            first = len(self.features.classes)
+            code[..., first : first + EXTENTS] *= scale[:, None, None]
+            mean, spread = mean * scale[:, None, None], spread * scale.square()[:, None, None, None]
+        for kind in "Rt":
+            own, other = (values.pop(f"{kind}_world_{name}") for name in CANONICAL)
+            which = side.bool().reshape(-1, *[1] * (own.ndim - 1))
+            known = torch.where(which, other, own) if self.canonical else values[f"{kind}_world_object"]
+            values[f"{kind}_world_canonical"] = known
+        values["contact"] = values["contact"].float()
         return EchoWindow(
             **values,
-            has_object=active != NO_OBJECT,
+            has_object=row != NO_OBJECT,
             object_code=code,
             object_mean=mean,
             object_spread=spread,
-            valid=cut.valid,
-            noise=torch.randn(cut.count, features, generator=random.generator),
-            level_draws=torch.rand(cut.count, 4, generator=random.generator),
-            draws=torch.rand(DRAWS, generator=random.generator),
+            valid=batch.valid,
+            noise=draws.normal("noise", batch.count, self.features.human_size + OBJECT_SIZE + CONTACTS),
+            level_draws=draws.uniform("levels", batch.count, 4),
+            draws=draws.uniform("draws", DRAWS),
         )
 
 

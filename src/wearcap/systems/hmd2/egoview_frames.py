@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional as F
-from torch.utils.data import Dataset
 
 from wearcap.data.embeddings import pictures
 from wearcap.data.windows import Source
@@ -41,14 +40,14 @@ _SWAPPED = [index ^ 1 for index in range(len(POINTS))]
 
 
 class EgoFrame(NamedTuple):
-    """One frame, or a batch of them (a leading "batch" axis on every field)."""
+    """A batch of frames."""
 
-    picture: UInt8[Tensor, "*batch height width 3"]
-    point_cam: Float[Tensor, "*batch point 3"]
+    picture: UInt8[Tensor, "batch height width 3"]
+    point_cam: Float[Tensor, "batch point 3"]
     """`POINTS` in the camera's axes (m)."""
-    visible: Bool[Tensor, "*batch point"]
+    visible: Bool[Tensor, "batch point"]
     """Whether a point is within the image; occlusion is ignored."""
-    intrinsics: Float[Tensor, "*batch 4"]
+    intrinsics: Float[Tensor, "batch 4"]
     """fx, fy, cx, cy of the image (pixels)."""
 
 
@@ -71,11 +70,10 @@ def limb_points(
     return point_cam, camera.camera.project(point_cam)[1]
 
 
-class EgoFrames(Dataset):
+class EgoFrames:
     """Every `every`-th frame of the recordings of one split that have a motion and a head camera's images.
 
-    Images are decoded once, into arrays in each data set's `cache`, and memory-mapped. Items are indexed by
-    (frame, seed), or by frame.
+    Images are decoded once, into arrays in each data set's `cache`, and kept in memory.
     """
 
     def __init__(
@@ -85,7 +83,7 @@ class EgoFrames(Dataset):
 
         Augmentation is the training's, which works on whole batches. Raises WearcapError for a split without images.
         """
-        self._pictures, self.weights = list[UInt8[np.ndarray, "time height width 3"]](), torch.empty(0)
+        shown_frames = list[UInt8[np.ndarray, "time height width 3"]]()
         points, visible, weights, intrinsics = [], [], [], []
         for source in sources:
             store = RecordingStore.open(source.root)
@@ -101,7 +99,7 @@ class EgoFrames(Dataset):
                 weights.append(torch.full((len(frames),), source.weight, dtype=torch.float64))
                 lens = camera.camera
                 intrinsics.append(torch.tensor([lens.fx, lens.fy, lens.cx, lens.cy]).expand(len(frames), 4))
-                self._pictures.append(frames)
+                shown_frames.append(frames)
         if not points:
             what = f"no head camera images in split {split!r}"
             fix = "Prepare a data set with them: wearcap prepare simulated camera=true"
@@ -112,18 +110,14 @@ class EgoFrames(Dataset):
         if hand_share and split == "train" and shown.any() and not shown.all():
             own = self.weights[shown].sum() / self.weights.sum()
             self.weights = self.weights * torch.where(shown, hand_share / own, (1 - hand_share) / (1 - own))
-        self._first = np.cumsum([0, *(len(frames) for frames in self._pictures)])
+        self.pictures = torch.from_numpy(np.concatenate(shown_frames))
 
     def __len__(self) -> int:
         return len(self.point_cam)
 
-    def __getitem__(self, item: tuple[int, int] | int) -> EgoFrame:
-        index = item[0] if isinstance(item, tuple) else item
-        recording = int(np.searchsorted(self._first, index, side="right")) - 1
-        picture = self._pictures[recording][index - self._first[recording]]
-        return EgoFrame(
-            torch.from_numpy(picture.copy()), self.point_cam[index], self.visible[index], self.intrinsics[index]
-        )
+    def batch(self, index: Int64[Tensor, "batch"], seed: Int64[Tensor, "batch"]) -> EgoFrame:
+        """Frames by their numbers; nothing of them is random."""
+        return EgoFrame(self.pictures[index], self.point_cam[index], self.visible[index], self.intrinsics[index])
 
 
 @cache

@@ -1,8 +1,7 @@
 """Training windows of HMD² and of its baseline: head paths with the true pose and what surrounds the wearer."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,14 +9,17 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
-from wearcap.data.bodies import OtherPerson
-from wearcap.data.features import body_size, on_level_ground, true_foot_contact
+from wearcap.data.batch import Batch
+from wearcap.data.bodies import bones_in_parts, head_in_parts, size_in_parts
+from wearcap.data.features import on_level_ground, true_foot_contact
+from wearcap.data.packing import Track, require_rows
 from wearcap.data.surroundings import ConditionWindows
-from wearcap.data.transforms import Cut, Draws, Window, joint_twins
-from wearcap.data.windows import Content, open_recording
+from wearcap.data.transforms import joint_twins
+from wearcap.data.windows import Content
 from wearcap.errors import WearcapError
+from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
-from wearcap.systems.hmd2.conditions import CONDITIONS, side_by_side
+from wearcap.systems.hmd2.conditions import CONDITIONS
 from wearcap.tracking.floor import floor_from_path, floor_from_points
 
 MIN_FRAMES = 30
@@ -25,27 +27,27 @@ MIN_FRAMES = 30
 
 
 class HeadWindow(NamedTuple):
-    """One window, or a batch of them (a leading "batch" axis on every field); frames beyond a clip are padding."""
+    """A batch of windows; frames beyond a clip are padding."""
 
-    R_parent_joint: Float[Tensor, "*batch time joint 3 3"]
-    R_world_head: Float[Tensor, "*batch time 3 3"]
-    t_world_head: Float[Tensor, "*batch time 3"]
-    floor_height: Float[Tensor, "*batch time"]
+    R_parent_joint: Float[Tensor, "batch time joint 3 3"]
+    R_world_head: Float[Tensor, "batch time 3 3"]
+    t_world_head: Float[Tensor, "batch time 3"]
+    floor_height: Float[Tensor, "batch time"]
     """Floor height (m) below the head, from points if there are any, else from the head's path."""
-    floor_from_head: Float[Tensor, "*batch time"]
+    floor_from_head: Float[Tensor, "batch time"]
     """Floor height (m) below the head, from the head's path alone."""
-    valid: Bool[Tensor, "*batch time"]
-    t_parent_joint: Float[Tensor, "*batch joint 3"]
-    size: Float[Tensor, "*batch limb"]
+    valid: Bool[Tensor, "batch time"]
+    t_parent_joint: Float[Tensor, "batch joint 3"]
+    size: Float[Tensor, "batch limb"]
     """`body_size` of the wearer (m)."""
-    foot_contact: Float[Tensor, "*batch time foot"]
+    foot_contact: Float[Tensor, "batch time foot"]
     """1 where heel or toes of the left and right foot touch the floor."""
-    others: Float[Tensor, "*batch time feature"]
-    given: Bool[Tensor, "*batch time condition"]
+    others: Float[Tensor, "batch time feature"]
+    given: Bool[Tensor, "batch time condition"]
     """The other conditions: see `model.Conditions`."""
-    noise: Float[Tensor, "*batch time motion"]
-    level: Float[Tensor, "*batch 1"]
-    chance: Float[Tensor, "*batch choice"]
+    noise: Float[Tensor, "batch time motion"]
+    level: Float[Tensor, "batch 1"]
+    chance: Float[Tensor, "batch choice"]
     """Diffusion noise and level, and uniform random numbers that decide on dropping each of `CONDITIONS` and on
     self-conditioning; drawn here so that they depend on seed and step, not on the process."""
 
@@ -58,26 +60,12 @@ class HeadWindow(NamedTuple):
         return joints - joints[:, :, skeleton.index("head"), None]
 
 
-@dataclass(frozen=True, eq=False)
-class _HeadTrack:
-    """A recording's open file, and by the names of `HeadWindow` small values per frame and those of all windows."""
-
-    store: RecordingStore
-    name: str
-    file: RecordingFile
-    R_head_device: Float[Tensor, "3 3"]
-    values: dict[str, Tensor]
-    constants: dict[str, Tensor]
-    twins: dict[str, list[int]]
-    surrounded: bool
-    """Whether what surrounds it belongs to this body."""
-
-
 class HeadContent(Content):
     """Windows of head paths and motions, with other conditions by their names."""
 
-    draws = ("shift", "mirror", "ends", "end")
     any_body = True
+    sensed = frozenset({"R_world_head", "t_world_head", "floor_height", "floor_from_head"})
+    parts = frozenset({"t_world_head", "t_parent_joint", "size"})
 
     def __init__(self, conditions: Mapping[str, ConditionWindows] | None = None):
         self.conditions = dict(conditions or {})
@@ -86,63 +74,64 @@ class HeadContent(Content):
         for condition in self.conditions.values():
             condition.prepare(stores, split)
 
+    def settings(self) -> Any:
+        return {name: condition.key for name, condition in self.conditions.items()}
+
     def min_frames(self, window: int, stretch: float) -> int:
         return MIN_FRAMES
 
     def usable(self, store: RecordingStore, name: str) -> bool:
-        file = open_recording(store.path_of(name))
+        file = RecordingFile(store.path_of(name))
         return "points.points_world" in file.keys or on_level_ground(file)
 
-    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> _HeadTrack:
-        file = open_recording(store.path_of(name))
-        if file.length("head.timestamps") != file.length("motion.timestamps"):
-            what, fix = "head and motion have different lengths", "Prepare the recording again."
-            raise WearcapError(what, where=file.path, expected="both on one clock", fix=fix)
-        recording = file.load() if person is None else person.recording(file)
+    def twins(self, file: RecordingFile) -> dict[str, list[int]]:
+        joints = joint_twins(file.part("motion").skeleton)
+        return {"R_parent_joint": joints, "t_parent_joint": joints, "foot_contact": [1, 0]}
+
+    def track(self, store: RecordingStore, name: str, recording: Recording, every: int) -> Track:
         head, motion = recording.head, recording.motion
         assert head is not None
         assert motion is not None
-        stature, t_world_head = motion.skeleton.height_of("head"), head.T_world_head.t
-        from_path = floor_from_path(head.timestamps, t_world_head, stature)
-        from_points = floor_from_points(recording.points, t_world_head, stature)
+        require_rows({"head": head.timestamps, "motion": motion.timestamps}, store.path_of(name))
+        stature, T_world_head = motion.skeleton.height_of("head"), head.T_world_head
+        from_path = floor_from_path(head.timestamps, T_world_head.t, stature)
+        from_points = floor_from_points(recording.points, T_world_head.t, stature)
+        conditions = {key: condition.frames(store, name) for key, condition in self.conditions.items()}
         values = {
-            "t_world_head": t_world_head,
+            "R_parent_joint": motion.R_parent_joint,
+            "R_world_head": T_world_head.R,
+            "t_world_head": head_in_parts(motion, T_world_head.t),
             "floor_height": from_path if from_points is None else from_points,
             "floor_from_head": from_path,
-            "foot_contact": true_foot_contact(recording).float(),
+            "foot_contact": true_foot_contact(recording),
+            **{key: row for key, (_, row) in conditions.items()},
         }
-        constants = {"t_parent_joint": motion.skeleton.t_parent_joint, "size": body_size(motion.skeleton)}
-        twins = dict.fromkeys(("R_parent_joint", "t_parent_joint"), joint_twins(motion.skeleton))
-        twins |= {"foot_contact": [1, 0]}
-        return _HeadTrack(store, name, file, head.R_head_device, values, constants, twins, surrounded=person is None)
+        constants = {"t_parent_joint": bones_in_parts(motion.skeleton), "size": size_in_parts(motion.skeleton)}
+        return Track(values, constants, {key: table for key, (table, _) in conditions.items()})
 
-    def read(self, track: _HeadTrack, cut: Cut, random: Draws) -> Window:
-        start, stop = cut.bounds
-        R_world_head = track.file.window("head.R_world_device", start, stop) @ track.R_head_device.mT
-        local = track.file.window("motion.R_parent_joint", start, stop)
-        values = {
-            "R_parent_joint": cut.take("R_parent_joint", local, start),
-            "R_world_head": cut.take("R_world_head", R_world_head, start, sensed=True),
-        }
-        values |= {name: cut.take(name, part, sensed=name != "foot_contact") for name, part in track.values.items()}
-        return Window(values | track.constants, track.twins)
-
-    def item(self, track: _HeadTrack, cut: Cut, window: Window, random: Draws) -> HeadWindow:
+    def batch(self, batch: Batch) -> HeadWindow:
         """Raises WearcapError where a condition was scaled that does not follow."""
         metric = [name for name, condition in self.conditions.items() if condition.metric]
-        if window.scale != 1 and metric:
+        if batch.scale is not None and metric:
             fix = f"Leave out transforms.scale, or {', '.join(metric)} (surroundings=head)."
             raise WearcapError(f"codes of {metric[0]} cannot be scaled", fix=fix)
-        start, stop = cut.bounds
-        read = [one.read(track.store, track.name, start, stop, window.mirrored) for one in self.conditions.values()]
-        others, given = side_by_side(read, stop - start)
-        frames = cut.frames - start
+        values, draws = dict(batch.values), batch.draws
+        rows = [values.pop(name) for name in self.conditions]
+        side = torch.zeros_like(batch.track) if batch.mirrored is None else batch.mirrored.long()
+        found = [batch.packed.tables[name][row, side[:, None]].float() for name, row in zip(self.conditions, rows)]
+        none = torch.zeros(*batch.valid.shape, 0, device=batch.device)
+        given = torch.stack([row >= 0 for row in rows], -1) if rows else none.bool()
+        if batch.others is not None:  # what surrounds the wearer does not belong to another body
+            given = given & ~batch.others[:, None, None]
+            others = batch.others[:, None]
+            values["floor_height"] = torch.where(others, values["floor_from_head"], values["floor_height"])
+        values["foot_contact"] = values["foot_contact"].float()
         return HeadWindow(
-            **window.values,
-            valid=cut.valid,
-            others=others[frames],
-            given=given[frames] & track.surrounded,
-            noise=torch.randn(cut.count, 6 * len(track.constants["t_parent_joint"]) + FEET, generator=random.generator),
-            level=torch.rand(1, generator=random.generator),
-            chance=torch.rand(len(CONDITIONS) + 1, generator=random.generator),
+            **values,
+            valid=batch.valid,
+            others=torch.cat([none, *found], -1),
+            given=given,
+            noise=draws.normal("noise", batch.count, 6 * values["R_parent_joint"].shape[2] + FEET),
+            level=draws.uniform("level", 1),
+            chance=draws.uniform("chance", len(CONDITIONS) + 1),
         )

@@ -1,39 +1,39 @@
 """Training of the autoencoder of the points around the body (thesis §6.2.1, §6.4), and its windows of voxel grids."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.data.bodies import OtherPerson
-from wearcap.data.transforms import Cut, Draws, Window
+from wearcap.data.batch import Batch
+from wearcap.data.packing import Track
 from wearcap.data.windows import Content, Windows, drawn_batches
 from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.recording import HeadStream
+from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.voxels import VoxelGrid, VoxelMap, mirrored
 from wearcap.training.base import Optimization, Training
 
 
 class Places(NamedTuple):
-    """Voxel grids (truncated distances, m) of some frames, or a batch of them (a leading "batch" axis)."""
+    """Voxel grids (truncated distances, m) of the frames of a batch of windows."""
 
-    grids: Float[Tensor, "*batch time x y z"]
+    grids: Float[Tensor, "batch time x y z"]
 
 
 class PlaceContent(Content):
-    """Voxel grids of `frames` random frames of each window, of recordings that have points.
-
-    A track is a recording's map of points, and its head stream.
-    """
+    """Voxel grids of recordings that have points, at the rate of the windows; distances are kept in 255 steps."""
 
     requires = " with points that tracking found"
-    tracks_at_once = 512
+    own_rate = True
 
-    def __init__(self, grid: VoxelGrid, frames: int):
-        self.grid, self.frames = grid, frames
+    def __init__(self, grid: VoxelGrid):
+        self.grid = grid
+
+    def settings(self) -> Any:
+        return self.grid
 
     def usable(self, store: RecordingStore, name: str) -> bool:
         file = RecordingFile(store.path_of(name))
@@ -42,21 +42,19 @@ class PlaceContent(Content):
     def min_frames(self, window: int, stretch: float) -> int:
         return 1
 
-    def open(
-        self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None
-    ) -> tuple[VoxelMap, HeadStream]:
-        file = RecordingFile(store.path_of(name))
-        cloud, head, surroundings = file.part("points"), file.part("head"), VoxelMap(self.grid)
+    def track(self, store: RecordingStore, name: str, recording: Recording, every: int) -> Track:
+        cloud, head, surroundings = recording.points, recording.head, VoxelMap(self.grid)
+        assert cloud is not None
+        assert head is not None
         surroundings.add(cloud.points_world, cloud.first_seen)
-        return surroundings, head
+        grids = surroundings.voxelize(head.T_world_device[::every], head.timestamps[::every])
+        return Track({"grids": (255 / self.grid.clip_m * grids).round().to(torch.uint8)})
 
-    def read(self, track: tuple[VoxelMap, HeadStream], cut: Cut, random: Draws) -> Window:
-        (surroundings, head), valid = track, int(cut.valid.sum())
-        chosen = cut.frames[torch.randint(valid, (self.frames,), generator=random.generator)]
-        return Window({"grids": surroundings.voxelize(head.T_world_device[chosen], head.timestamps[chosen])})
-
-    def item(self, track: tuple[VoxelMap, HeadStream], cut: Cut, window: Window, random: Draws) -> Places:
-        return Places(mirrored(window.values["grids"]) if window.mirrored else window.values["grids"])
+    def batch(self, batch: Batch) -> Places:
+        grids = self.grid.clip_m / 255 * batch.values["grids"].float()
+        if batch.mirrored is not None:
+            grids = torch.where(batch.mirrored[:, None, None, None, None], mirrored(grids), grids)
+        return Places(grids)
 
 
 class VoxelReconstruction(Training):

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
@@ -63,11 +62,16 @@ def synthetic_wrists(
     body = forward_kinematics(skeleton, R_parent_joint, t_world_root)
     wrists = skeleton.indices(*WRISTS)
     t_world_wrist = body.t[:, wrists]
-    paths = rearrange(t_world_wrist, "time wrist xyz -> time (wrist xyz)")
-    acc = acceleration(paths, fps, ACCELERATION_FRAMES * every)
+    return body.R[:, wrists], watch_acceleration(t_world_wrist, fps, every), t_world_wrist
+
+
+def watch_acceleration(
+    t_world_wrist: Float[Tensor, "time *wrist 3"], fps: float, every: int = 1
+) -> Float[Tensor, "time *wrist 3"]:
+    """Acceleration (m/s²) of points as watches give it (MocapEvery eq. 8), as `synthetic_wrists` does."""
+    acc = acceleration(t_world_wrist.flatten(1), fps, ACCELERATION_FRAMES * every)
     frames = torch.arange(len(acc))[:, None] + every * torch.arange(-3, 4)
-    acc = acc[frames.clamp(0, len(acc) - 1)].mean(1)
-    return body.R[:, wrists], rearrange(acc, "time (wrist xyz) -> time wrist xyz", xyz=3), t_world_wrist
+    return acc[frames.clamp(0, len(acc) - 1)].mean(1).reshape(t_world_wrist.shape)
 
 
 @dataclass(frozen=True)
