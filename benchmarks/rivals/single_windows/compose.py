@@ -55,6 +55,9 @@ def _as_before(part: Any) -> Any:
     found = next((there for there in MOVED if target == there or target.startswith(f"{there}.")), None)
     if found is not None:
         part["_target_"] = f"{__package__}.{MOVED[found]}{target.removeprefix(found)}"
+    if target.endswith(".OtherBodies"):
+        share = part.pop("share", 0.875)
+        part["count"] = round(share / (1 - share))
     if target.endswith(".Loading"):
         known = {"_target_", *(field.name for field in fields(Loading))}
         part = {name: value for name, value in part.items() if name in known}
