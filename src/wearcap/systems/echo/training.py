@@ -42,8 +42,9 @@ class EchoDiffusion(Training):
     be known (`training_windows.canonical`), unless clean frames show another.
     """
 
+    _feet: Tensor
+
     system = Echo
-    """The system that captures with the network."""
 
     def __init__(
         self,
@@ -68,7 +69,10 @@ class EchoDiffusion(Training):
         self.encoder = None if encoder is None else encoder.requires_grad_(False).eval()
         self.features, self.schedule, self.skeleton, self.mix = features, schedule, skeleton, levels
         self.contacts = contacts
-        self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        self.register_buffer(
+            "_feet", torch.tensor(feet), persistent=False
+        )  # as a list it would go to a GPU in each step
 
     def pipeline_parts(self) -> dict[str, EchoModel]:
         parts = self.net, self.features, self.schedule, self.skeleton, self.encoder, self.contacts

@@ -66,6 +66,7 @@ class MotionDiffusion(Training):
     """
 
     system = HMD2
+    _feet: Tensor
 
     def __init__(
         self,
@@ -92,7 +93,8 @@ class MotionDiffusion(Training):
             if condition.weights is not None:
                 self.add_module(condition.weights, condition.encoder)
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
-        self._feet = [skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")]
+        feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        self.register_buffer("_feet", torch.tensor(feet), persistent=False)
 
     def pipeline_parts(self) -> dict[str, DiffusionModel]:
         parts = self.features, self.schedule, self.skeleton, self.fps, self.given

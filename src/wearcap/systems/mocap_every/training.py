@@ -28,6 +28,8 @@ class WatchRegression(Training):
     """
 
     _joint_weights: Tensor
+    _ends: Tensor
+    _feet: Tensor
 
     system = MocapEvery
 
@@ -48,8 +50,9 @@ class WatchRegression(Training):
         self.net = net(feature_size=features.size, motion_size=features.motion_size)
         self.features, self.skeleton, self.fps = features, skeleton, fps
         self.contact_share = contact_share
-        self._ends = skeleton.indices(*ENDS)
-        self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        self.register_buffer("_ends", torch.tensor(skeleton.indices(*ENDS)), persistent=False)
+        self.register_buffer("_feet", torch.tensor(feet), persistent=False)
         weights = torch.ones(len(skeleton))
         weights[self._ends] = end_weight
         self.register_buffer("_joint_weights", weights / weights.mean(), persistent=False)
