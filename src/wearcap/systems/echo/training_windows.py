@@ -236,9 +236,7 @@ class EchoContent(Content):
     any_body = own_rate = True
     sensed = frozenset({*ThreePoints._fields, "floor_height"})
     parts = frozenset({"t_world_point", "t_parent_joint", "size"})
-    jumps: ClassVar[dict[str, str]] = {
-        f"{kind}_world_{name}": "object" for name in ("object", *CANONICAL) for kind in "Rt"
-    }
+    jumps: ClassVar[dict[str, str]] = {f"{kind}_world_{name}": "object" for name in ("object", *CANONICAL) for kind in "Rt"}
 
     def __init__(
         self,
