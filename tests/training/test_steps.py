@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
 from datetime import timedelta
 from types import SimpleNamespace
 
@@ -19,7 +20,9 @@ from torch import nn
 
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.models.layers import attention
+from wearcap.training import losses
 from wearcap.training.base import WORTH_COMPILING, Optimization, Training, timer_of
 from wearcap.training.callbacks import MovingAverage, Speed, StepsProgressBar
 from wearcap.training.schedules import warmup_cosine
@@ -128,6 +131,7 @@ def test_compiled_steps_are_those_of_eager_ones():
 
 HALVES = """
 import sys, torch
+from contextlib import nullcontext
 from datetime import timedelta
 sys.path.insert(0, {folder!r})
 from test_steps import Batches, MovingAverage, Small, Speed, trainer, warmup_cosine
@@ -242,3 +246,14 @@ def test_attention_in_bfloat16_on_a_cpu_is_pytorchs():
     mask = (torch.rand(2, 1, 7, 7) < 0.7) | torch.eye(7, dtype=torch.bool)
     wide = torch.nn.functional.scaled_dot_product_attention(q.float(), k.float(), v.float(), mask)
     torch.testing.assert_close(attention(q, k, v, mask).float(), wide, atol=0.03, rtol=0.03)
+
+
+def test_geometry_is_exact_under_autocast():
+    torch.manual_seed(0)
+    R, t = rotation.exp(torch.randn(9, 3)), 10 * torch.rand(9, 3, 1)
+    errors = []
+    for context in (nullcontext(), losses.exact(t)):
+        with torch.autocast("cpu", torch.bfloat16), context:
+            errors.append(((R @ t).double() - R.double() @ t.double()).abs().max())
+    assert errors[0] > 5e-3
+    assert errors[1] < 1e-5

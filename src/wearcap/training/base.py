@@ -120,7 +120,7 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
 
     def training_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> Tensor:
         measured = self._measure(batch)
-        if is_logged(self.trainer, self.global_step + 1):
+        if is_logged(self.trainer, self.global_step + 1) or timer_of(self.trainer):  # whose last step is logged, too
             values = {f"train/{name}": value.detach().clone() for name, value in measured.items()}
             self.log_dict(values, batch_size=len(batch[0]), prog_bar=True)
         return measured["loss"]

@@ -153,7 +153,7 @@ class Speed(Callback):
         values = {
             "windows_per_s": sum(windows for _, windows in self._steps[1:]) / seconds,
             "waiting": sum(_seconds(*wait) for wait in self._waits) / seconds,
-            "minutes_left": left / 60,
+            "minutes_left": max(0.0, left / 60),
         }
         return {name: value for name, value in values.items() if math.isfinite(value)}
 
