@@ -80,14 +80,16 @@ def carrying(seconds: float = 2.0, name: str = "carry", carried=CARRIED, fps: fl
     )
 
 
-def carried_dataset(root: Path, splits: Sequence[str] = ("train", "val", "test"), fps: float = FPS) -> str:
+def carried_dataset(
+    root: Path, splits: Sequence[str] = ("train", "val", "test"), fps: float = FPS, carried=CARRIED
+) -> str:
     """One carrying walk per split, with its boxes' file."""
     from dataclasses import replace
 
     store = RecordingStore(root)
-    write_environment(boxes(), root / "scene")
+    write_environment(boxes(carried), root / "scene")
     for number, split in enumerate(splits):
-        recording = carrying(2.0, f"c{number}", fps=fps)
+        recording = carrying(2.0, f"c{number}", carried, fps)
         store.add(replace(recording, environment="scene/environment.json"), split=split, config_hash="test")
     return str(root)
 

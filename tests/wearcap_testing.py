@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
+from wearcap.data.batch import Batch
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.recording import (
@@ -86,3 +88,21 @@ def pushed(session: Session, samples: list) -> list[Motion | None]:
     """Each wearer's poses after its new samples."""
     session.push(samples)
     return session.poses()
+
+
+class AlwaysMirrored:
+    """A transform that mirrors every window."""
+
+    def cut(self, batch: Batch) -> Batch:
+        return replace(batch, mirrored=torch.ones(len(batch.track), dtype=torch.bool))
+
+
+def window_of(windows: Any, index: int = 0, seed: int = 0) -> Any:
+    """One window of a data set, without the batch's axis."""
+    batch = windows.batch(torch.tensor([index]), torch.tensor([seed]))
+    return type(batch)(*(value[0] for value in batch))
+
+
+def seeded(windows: Any, index: int, count: int) -> Any:
+    """A window of a data set by `count` seeds, as a batch."""
+    return windows.batch(torch.full((count,), index), torch.arange(count))

@@ -9,18 +9,19 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from wearcap.body.contact_points import BODY_POINTS
+from wearcap.data.batch import Batch
+from wearcap.data.draws import Draws
 from wearcap.data.features import body_size
 from wearcap.data.windows import MIN_SCALE, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording import Motion
-from wearcap.systems.echo.features import OBJECT_SIZE, Body, EchoFeatures, ThreePoints
+from wearcap.systems.echo.features import OBJECT_SIZE, EchoFeatures, ThreePoints
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import motion_of, object_tracks
 from wearcap.systems.echo.queue import Outputs
-from wearcap.systems.echo.training_windows import EchoContent
+from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.tracking.head_path import head_path
 
 NO_CLASS = "none"
@@ -38,6 +39,21 @@ def _channels(
     heading since the window's start, and without limb lengths."""
     condition = features.condition(ThreePoints(*(part[None] for part in points)), floor_height[None], size[None])[0]
     return torch.cat([condition[:, :36], condition[:, 39:54], condition[:, 56:57]], 1)
+
+
+def whole_recording(dataset: Windows, number: int) -> EchoWindow:
+    """A whole recording of a data set as one window, with the wearer's own body and nothing changed."""
+    count, one = int(dataset.packed.length[number]), torch.tensor([number])
+    parts = dataset.content.parts if dataset.bodies is not None else ()
+    read = Batch(dataset.packed, Draws(one), one, 0 * one, count, dataset.fps).read()
+    return dataset.content.batch(read.changed(**{name: read.values[name].sum(-2) for name in parts}))
+
+
+def _category(features: EchoFeatures, track: EchoWindow, frame: int) -> str:
+    """Class of the active object at a frame."""
+    if not track.has_object[0, frame]:
+        return NO_CLASS
+    return features.classes[int(track.object_code[0, frame, : len(features.classes)].argmax())]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +84,17 @@ class NearestEcho:
         features, encoder = _own(dataset.content.features), dataset.content.encoder
         channels, outputs, starts, labels, first = [], [], [], [], 0
         for number in range(len(dataset.recordings)):
-            track = dataset.track(number)
-            count = len(track.floor_height)
-            channels.append(_channels(features, track.points, track.floor_height, track.size))
+            track = whole_recording(dataset, number)
+            count = track.floor_height.shape[1]
+            points = ThreePoints(*(part[0] for part in track.points))
+            channels.append(_channels(features, points, track.floor_height[0], track.size[0]))
             # Ground truth in each frame's head-centred coordinates.
-            frame = features.canonical(ThreePoints(*(part[None] for part in track.points)))
-            body, T = Body(*(part[None] for part in track.body)), track.T_world_object
-            T = Rigid(T.R[None], T.t[None])
-            parts = features.encode_body(body, frame), features.encode_object(T, frame), track.contact[None]
-            outputs.append(torch.cat(parts, -1)[0])
+            frame = features.canonical(track.points)
+            T = features.encode_object(track.T_world_object, frame)
+            outputs.append(torch.cat([features.encode_body(track.body, frame), T, track.contact], -1)[0])
             for start in range(0, count - window + 1, stride):
-                active = int(track.active[start + window // 2])
                 starts.append(first + start)
-                labels.append(track.objects[active].category if active >= 0 else NO_CLASS)
+                labels.append(_category(features, track, start + window // 2))
             first += count
         whole = torch.cat(channels)
         mean, scale = whole.mean(0), whole.std(0).clamp_min(MIN_SCALE)
@@ -151,16 +165,17 @@ class RigidWrist:
         features, encoder = _own(dataset.content.features), dataset.content.encoder
         rows: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
         for number in range(len(dataset.recordings)):
-            track = dataset.track(number)
-            frame = features.canonical(ThreePoints(*(part[None] for part in track.points)))
-            heading = frame.R[0]
-            for index, shape in enumerate(track.objects):
-                touched = (track.active == index) & (track.contact[:, :BODY_POINTS].amax(1) > 0)
-                T, wrists = track.T_world_object[touched], track.points.t_world_point[touched, 1:]
+            track = whole_recording(dataset, number)
+            frame = features.canonical(track.points)
+            heading, handled = frame.R[0], track.has_object[0] & (track.contact[0, :, :BODY_POINTS].amax(1) > 0)
+            kinds = track.object_code[0, :, : len(features.classes)].argmax(1)
+            for kind in kinds[handled].unique().tolist():
+                touched = handled & (kinds == kind)
+                T, wrists = track.T_world_object[0, touched], track.t_world_point[0, touched, 1:]
                 back = heading[touched].mT
                 place = (back @ (T.t - frame.t[0][touched])[..., None])[..., 0]
                 offset = (back[:, None] @ (T.t[:, None] - wrists)[..., None])[..., 0]
-                rows.setdefault(shape.category, []).append((place, offset, back @ T.R))
+                rows.setdefault(features.classes[kind], []).append((place, offset, back @ T.R))
         place, offset, turn = {}, {}, {}
         for name, parts in rows.items():
             places, offsets, R = (torch.cat(each) for each in zip(*parts))

@@ -6,12 +6,11 @@ from pathlib import Path
 import torch
 from rich.console import Console
 from rich.progress import track
-from torch.utils.data import DataLoader
 
 from benchmarks.tables.tabling import new_table, write_tree
 from wearcap.data.windows import Source
 from wearcap.models.checkpoint import load_trained
-from wearcap.systems.hmd2.egoview_frames import POINTS, EgoFrame, EgoFrames
+from wearcap.systems.hmd2.egoview_frames import POINTS, EgoFrames
 from wearcap.systems.hmd2.egoview_training import EgoView, view_scores
 
 COLUMNS = {
@@ -56,10 +55,9 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 
 
 def _scores(system: EgoView, frames: EgoFrames) -> dict[str, float]:
-    batches = DataLoader(frames, batch_size=256)
     predicted, truth = [], []
-    for batch in track(batches, description="frames"):
-        batch = EgoFrame(*batch)
+    for numbers in track(torch.arange(len(frames)).split(256), description="frames"):
+        batch = frames.batch(numbers, numbers)
         predicted.append(system(system.pictures(batch)))
         truth.append((batch.point_cam, batch.visible))
     logits, places = (torch.cat(parts) for parts in zip(*predicted))

@@ -41,10 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def grids_of(root: Path, split: str, count: int, grid: VoxelGrid) -> Tensor:
     """Grids (m) spread evenly over a split's windows of 4 s."""
-    content = PlaceContent(grid, frames=8)
-    dataset = Windows([Source(str(root))], split, content=content, window=240, stride=240, fps=60.0)
-    chosen = torch.linspace(0, len(dataset) - 1, max(1, count // 8)).long().tolist()
-    return torch.cat([dataset[(index, seed)].grids for seed, index in enumerate(chosen)])
+    dataset = Windows([Source(str(root))], split, content=PlaceContent(grid), window=8, stride=8, fps=2.0, every=None)
+    chosen = torch.linspace(0, len(dataset) - 1, max(1, count // 8)).long()
+    return dataset.batch(chosen, chosen).grids.flatten(0, 1)
 
 
 def principal(train: Tensor, size: int = 128) -> Rebuild:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from wearcap.data.bodies import OtherBodies
 from wearcap.data.surroundings import Embeddings, PlaceCodes, embeddings_of, latest_before
 from wearcap.data.transforms import EarlyEnd, Mirror
 from wearcap.data.windows import Source, Windows
@@ -16,7 +17,7 @@ from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.places import EVERYTHING, Places
 from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap.tracking.floor import floor_from_path, floor_from_points
-from wearcap_testing import recording_of, swaying_motion
+from wearcap_testing import recording_of, seeded, swaying_motion, window_of
 
 SIZE = 5
 
@@ -24,7 +25,7 @@ SIZE = 5
 class CountedCodes(PlaceCodes):
     """Codes that count the frames, and count down from zero in the mirror."""
 
-    size = 3
+    size, key = 3, "counted"
 
     def __init__(self):
         pass
@@ -69,17 +70,13 @@ def dataset(store: RecordingStore, **transforms) -> Windows:
 
 
 def first_of(windows: Windows, name: str, start: int) -> int:
-    return next(
-        index
-        for index, (recording, first, _) in enumerate(windows.starts.tolist())
-        if windows.recordings[recording][1] == name and first == start
-    )
+    return windows.starts.tolist().index([["a", "b"].index(name), start])
 
 
 def test_codes_and_pictures_are_those_of_the_windows_frames(store):
     windows = dataset(store)
     assert windows.content.conditions["image"].size == SIZE
-    window = windows[first_of(windows, "a", 60)]
+    window = window_of(windows, first_of(windows, "a", 60))
     frames = torch.arange(60, 180)
     assert torch.equal(window.others[:, 0], frames.float())
     assert torch.equal(window.others[:, -1], (frames // 2).float()), "each picture serves two frames"
@@ -88,7 +85,7 @@ def test_codes_and_pictures_are_those_of_the_windows_frames(store):
 
 def test_a_recording_without_pictures_is_reported(store):
     windows = dataset(store)
-    window = windows[first_of(windows, "b", 0)]
+    window = window_of(windows, first_of(windows, "b", 0))
     assert window.others.shape == (120, 3 + SIZE)
     assert window.given.all(0).tolist() == [True, False]
 
@@ -96,21 +93,31 @@ def test_a_recording_without_pictures_is_reported(store):
 def test_the_mirror_reads_what_the_mirror_shows(store):
     windows = dataset(store, mirror=Mirror())
     index = first_of(windows, "a", 60)
-    seen = [windows[(index, seed)] for seed in range(12)]
-    signs = {(w.others[:, 0].sign().sum().item(), w.others[:, -1].sign().sum().item()) for w in seen}
-    assert signs == {(120.0, 120.0), (-120.0, -120.0)}
+    signs = seeded(windows, index, 12).others[..., [0, -1]].sign().sum(1)
+    assert {*map(tuple, signs.tolist())} == {(120.0, 120.0), (-120.0, -120.0)}
 
 
 def test_beginnings_are_cut_short(store):
     whole, cut = dataset(store), dataset(store, ending=EarlyEnd(1.0))
-    lengths = {int(cut[(0, seed)].valid.sum()) for seed in range(20)}
-    assert whole[(0, 0)].valid.all()
+    lengths = {*seeded(cut, 0, 20).valid.sum(1).tolist()}
+    assert window_of(whole).valid.all()
     assert min(lengths) >= 10
     assert max(lengths) < 120
     assert len(lengths) > 10
-    window = cut[(0, 3)]
+    window = window_of(cut, 0, 3)
     last = int(window.valid.sum()) - 1
     assert torch.equal(window.others[last:], window.others[last : last + 1].expand(120 - last, -1))
+
+
+def test_what_surrounds_a_wearer_is_not_given_with_another_body(store):
+    conditions = {"points": CountedCodes(), "image": Embeddings("toy")}
+    settings = {"content": HeadContent(conditions), "window": 120, "stride": 60, "fps": 60.0}
+    windows = Windows([Source(str(store.root))], "train", True, bodies=OtherBodies(share=0.5), **settings)
+    batch = seeded(windows, first_of(windows, "a", 0), 40)
+    own = (batch.size - batch.size.mode(0).values).abs().amax(1) < 1e-6
+    assert 8 < own.sum() < 32
+    assert torch.equal(batch.given.all(1), own[:, None].expand(-1, 2))
+    assert torch.equal(batch.floor_height[~own], batch.floor_from_head[~own])
 
 
 def test_data_without_the_encoders_embeddings_is_refused(store):

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import lightning
 import torch
@@ -17,6 +17,7 @@ ON_DEVICE = 0.6
 """Share of a device's free memory that recordings may take; larger data sets stay in the host's memory."""
 
 
+@runtime_checkable
 class _Drawn(Protocol):
     """A data set with sampling weights, of which whole batches are drawn."""
 

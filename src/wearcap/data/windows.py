@@ -141,7 +141,7 @@ class Windows:
             raise WearcapError(what, where=", ".join(source.root for source in sources), expected=expected)
         if len(steps := {each.rate for each in found}) > 1 and not content.own_rate:
             raise WearcapError(f"recordings of {sorted(steps)} frames per frame of a window", expected="one rate")
-        self.starts, self.step = torch.tensor(rows)[:, :2], rows[0][2]
+        self.recordings, self.starts, self.step = found, torch.tensor(rows)[:, :2], rows[0][2]
         self.weights = torch.tensor([each.weight for each in found for _ in range(each.count)], dtype=torch.float64)
         self._pack(found)
 

@@ -115,7 +115,7 @@ def echo_track(
     if head is not None and len(head.timestamps) == len(motion):
         R_world_point[:, 0] = head.T_world_head.R
         t_world_point[:, 0] = head_in_parts(motion, head.T_world_head.t)
-    found = _Objects.of(recording, environment, reader, take, within_m)
+    found = found_objects(recording, environment, reader, take, within_m)
     canonical_poses = [
         canonical(found.pose, found.shapes, R_world_point[take, 0], found.touch.any(1), found.active, side)
         for side in (1.0, -1.0)
@@ -138,7 +138,7 @@ def echo_track(
     return Track(values, constants, {"object": torch.stack(rows) if rows else none})
 
 
-class _Objects(NamedTuple):
+class FoundObjects(NamedTuple):
     """A recording's objects, and at some of its frames the active one."""
 
     shapes: list[ObjectShape]
@@ -149,40 +149,40 @@ class _Objects(NamedTuple):
     touch: Bool[Tensor, "time point"]
     """Which points of the body touch it."""
 
-    @classmethod
-    def of(
-        cls,
-        recording: Recording,
-        environment: Environment | None,
-        reader: ObjectReader,
-        take: Int64[Tensor, "time"],
-        within_m: float,
-    ) -> "_Objects":
-        motion = recording.motion
-        assert motion is not None
-        spans = true_spans(recording) if environment is not None and recording.object_motion else []
-        names = list(dict.fromkeys(span.object for span in spans))
-        shapes = [reader(environment.by_name(name)) for name in names] if environment is not None else []
-        # The body's surface takes a quarter of a second, and is asked for where there is something to touch alone.
-        surface = contact_points(anny_body(motion.skeleton, recording.shape or None)) if shapes else None
-        active = active_at(spans, names, motion.timestamps[take])
-        R, t = torch.eye(3).repeat(len(take), 1, 1), torch.zeros(len(take), 3)
-        touch = torch.zeros(len(take), BODY_POINTS, dtype=torch.bool)
-        for number, shape in enumerate(shapes):
-            rows = (active == number).nonzero()[:, 0]
-            if not len(rows) or environment is None or surface is None:
-                continue
-            # The motion and an object's trajectory share their clock; an object without one stays where it was.
-            track, still = recording.object_motion.get(names[number]), environment.by_name(names[number]).T_world_object
-            if track is None:
-                T = Rigid(still.R.expand(len(rows), 3, 3), still.t.expand(len(rows), 3))
-            else:
-                T = track.T_world_body[take[rows]]
-            T = shape.centred(T)
-            R[rows], t[rows] = T.R, T.t
-            skin = surface.vertices(motion.T_world_joint[take[rows]])
-            touch[rows] = body_contact(skin, shape, T, within_m)
-        return cls(shapes, active, Rigid(R, t), touch)
+
+def found_objects(
+    recording: Recording,
+    environment: Environment | None,
+    reader: ObjectReader,
+    take: Int64[Tensor, "time"],
+    within_m: float,
+) -> FoundObjects:
+    """The objects that are handled in a recording, at its frames `take`; contact is a distance of at most `within_m` (m)."""
+    motion = recording.motion
+    assert motion is not None
+    spans = true_spans(recording) if environment is not None and recording.object_motion else []
+    names = list(dict.fromkeys(span.object for span in spans))
+    shapes = [reader(environment.by_name(name)) for name in names] if environment is not None else []
+    # The body's surface takes a quarter of a second, and is asked for where there is something to touch alone.
+    surface = contact_points(anny_body(motion.skeleton, recording.shape or None)) if shapes else None
+    active = active_at(spans, names, motion.timestamps[take])
+    R, t = torch.eye(3).repeat(len(take), 1, 1), torch.zeros(len(take), 3)
+    touch = torch.zeros(len(take), BODY_POINTS, dtype=torch.bool)
+    for number, shape in enumerate(shapes):
+        rows = (active == number).nonzero()[:, 0]
+        if not len(rows) or environment is None or surface is None:
+            continue
+        # The motion and an object's trajectory share their clock; an object without one stays where it was.
+        track, still = recording.object_motion.get(names[number]), environment.by_name(names[number]).T_world_object
+        if track is None:
+            T = Rigid(still.R.expand(len(rows), 3, 3), still.t.expand(len(rows), 3))
+        else:
+            T = track.T_world_body[take[rows]]
+        T = shape.centred(T)
+        R[rows], t[rows] = T.R, T.t
+        skin = surface.vertices(motion.T_world_joint[take[rows]])
+        touch[rows] = body_contact(skin, shape, T, within_m)
+    return FoundObjects(shapes, active, Rigid(R, t), touch)
 
 
 def _described(shape: ObjectShape) -> Float[Tensor, "side value"]:
@@ -236,7 +236,9 @@ class EchoContent(Content):
     any_body = own_rate = True
     sensed = frozenset({*ThreePoints._fields, "floor_height"})
     parts = frozenset({"t_world_point", "t_parent_joint", "size"})
-    jumps: ClassVar[dict[str, str]] = {f"{kind}_world_{name}": "object" for name in ("object", *CANONICAL) for kind in "Rt"}
+    jumps: ClassVar[dict[str, str]] = {
+        f"{kind}_world_{name}": "object" for name in ("object", *CANONICAL) for kind in "Rt"
+    }
 
     def __init__(
         self,
