@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body import kinematics_kernels
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import Skeleton, levels_of
 from wearcap.geometry.rigid import Rigid
 
 _WORTH_THREADS = 1 << 16
@@ -39,12 +39,18 @@ def forward_kinematics(
     offsets = offsets.to(R_parent_joint)
     if not _can_fuse(R_parent_joint, t_world_root, offsets):
         return level_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets)
+    return Rigid(*_fused(skeleton, R_parent_joint, t_world_root, offsets))
+
+
+@torch.compiler.disable
+def _fused(skeleton: Skeleton, R_parent_joint: Tensor, t_world_root: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """`forward_kinematics` by the kernels, to which a compiled function returns."""
     batch, joints = R_parent_joint.shape[:-3], len(skeleton)
     # Expanding raises on shapes that do not fit: the kernels check nothing.
     R_local, t_root = R_parent_joint.expand(*batch, joints, 3, 3), t_world_root.expand(*batch, 3)
     shared = offsets.numel() == 3 * joints
     rows = offsets if shared else offsets.expand(*batch, joints, 3)
-    return Rigid(*_Fused.apply(R_local, t_root, rows, np.array(skeleton.parents)))
+    return _Fused.apply(R_local, t_root, rows, np.array(skeleton.parents))
 
 
 def level_forward_kinematics(
@@ -54,9 +60,9 @@ def level_forward_kinematics(
     offsets: Float[Tensor, "*#batch joint 3"],
 ) -> Rigid:
     """Forward kinematics in plain tensor operations, one step per tree level: for any device, transform or compiler."""
-    # A compiler's traced tensors must not be cached: they are placeholders.
-    plan = _plan if torch.compiler.is_compiling() else _kept_plan
-    levels, back = plan(skeleton.levels, skeleton.parents, R_parent_joint.device)
+    # An exporter's traced tensors must not be cached: they are placeholders.
+    plan = _plan if torch.compiler.is_exporting() else _kept_plan
+    levels, back = plan(skeleton.parents, R_parent_joint.device)
     offsets = offsets.expand(*R_parent_joint.shape[:-3], len(skeleton), 3)
     R_levels, t_levels = [R_parent_joint[..., :1, :, :]], [t_world_root[..., None, :]]
     for joints, parent in levels:
@@ -66,11 +72,9 @@ def level_forward_kinematics(
     return Rigid(torch.cat(R_levels, -3)[..., back, :, :], torch.cat(t_levels, -2)[..., back, :])
 
 
-def _plan(
-    levels: tuple[tuple[int, ...], ...], parents: tuple[int, ...], device: torch.device
-) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
+def _plan(parents: tuple[int, ...], device: torch.device) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
     """Per level below the root: its joints and their parents' positions in the level above; then the inverse order."""
-    steps = []
+    steps, levels = [], levels_of(parents)
     for above, joints in itertools.pairwise(levels):
         places = [above.index(parents[joint]) for joint in joints]
         steps.append((torch.tensor(joints, device=device), torch.tensor(places, device=device)))
@@ -78,8 +82,13 @@ def _plan(
     return steps, order.argsort().to(device)
 
 
-_kept_plan = lru_cache(maxsize=64)(_plan)
-"""Index tensors per device: copying them to a GPU in every call would synchronise with it."""
+_cached_plan = lru_cache(maxsize=64)(_plan)
+
+
+@torch.compiler.assume_constant_result
+def _kept_plan(parents: tuple[int, ...], device: torch.device) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
+    """Index tensors per device: copying them to a GPU in every call would synchronise with it."""
+    return _cached_plan(parents, device)
 
 
 def site_positions(skeleton: Skeleton, T_world_joint: Rigid, names: tuple[str, ...]) -> Float[Tensor, "*batch site 3"]:
@@ -100,16 +109,19 @@ def local_rotations(
 
 
 def _can_fuse(*tensors: Tensor) -> bool:
-    """Whether the kernels support the inputs: plain CPU tensors of one precision, outside compilers and transforms."""
+    """Whether the kernels support the inputs: plain CPU tensors of one precision, outside exporters and transforms."""
     first = tensors[0]
     plain = all(
         tensor.device.type == "cpu" and tensor.dtype == first.dtype and type(tensor) in (Tensor, torch.nn.Parameter)
         for tensor in tensors
     )
-    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    if not plain or first.dtype not in (torch.float32, torch.float64):
+        return False
+    if torch.compiler.is_dynamo_compiling() and not torch.compiler.is_exporting():
+        return True
     # Inside torch.func's transforms tensors have no memory to hand to a kernel.
     transformed = torch._C._functorch.maybe_current_level() is not None  # pyright: ignore[reportAttributeAccessIssue]
-    return plain and first.dtype in (torch.float32, torch.float64) and not traced and not transformed
+    return not (torch.compiler.is_compiling() or torch.jit.is_tracing() or transformed)
 
 
 class _Fused(torch.autograd.Function):

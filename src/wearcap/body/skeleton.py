@@ -109,14 +109,6 @@ class Skeleton:
         return ancestors(self.parents, joint)
 
     @cached_property
-    def levels(self) -> tuple[tuple[int, ...], ...]:
-        """Joints by depth in the tree, the root's level first, for one batched step per level."""
-        depth = [0] * len(self)
-        for joint in range(1, len(self)):
-            depth[joint] = depth[self.parents[joint]] + 1
-        return tuple(tuple(j for j in range(len(self)) if depth[j] == level) for level in range(max(depth) + 1))
-
-    @cached_property
     def rest_joints(self) -> Float[Tensor, "joint 3"]:
         """Joint positions of the rest pose with the root at the origin (m)."""
         positions = [self.t_parent_joint[0] * 0]
@@ -161,6 +153,14 @@ class Skeleton:
     def scaled(self, scale: float) -> "Skeleton":
         """The skeleton with all bones and sites scaled by one factor."""
         return self.with_offsets(self.t_parent_joint * scale)
+
+
+def levels_of(parents: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """Joints by depth in the tree, the root's level first, for one batched step per level."""
+    depth = [0] * len(parents)
+    for joint in range(1, len(parents)):
+        depth[joint] = depth[parents[joint]] + 1
+    return tuple(tuple(j for j in range(len(parents)) if depth[j] == level) for level in range(max(depth) + 1))
 
 
 def ancestors(parents: Sequence[int], joint: int) -> list[int]:

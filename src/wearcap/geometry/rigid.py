@@ -30,8 +30,12 @@ class Rigid:
     def __matmul__(self, other):
         """Chain with a Rigid, or map points "*batch 3"; batch axes broadcast (clouds: `T[:, None] @ points`)."""
         if isinstance(other, Rigid):
-            return Rigid(self.R @ other.R, self @ other.t)
+            return self.chain(other)
         return (self.R @ other[..., None])[..., 0] + self.t
+
+    def chain(self, other: "Rigid") -> "Rigid":
+        """`self @ other`; what torch.compile should trace calls it, since operators of objects break its graphs."""
+        return Rigid(self.R @ other.R, self @ other.t)
 
     def inverse(self) -> "Rigid":
         R_inverse = self.R.transpose(-1, -2)

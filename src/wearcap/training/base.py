@@ -1,12 +1,33 @@
-"""The base of the LightningModules: seeded steps, optimiser from the config, logged losses."""
+"""The base of the LightningModules: seeded and compiled steps, optimiser from the config, logged losses."""
 
+import os
+import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import lightning
 import torch
+from lightning.pytorch.callbacks import Timer
 from torch import Tensor
+
+from wearcap.errors import require_choice
+
+WORTH_COMPILING = 1000
+"""Steps from which a compiled step saves a CPU more time than its compilation takes, a minute or two."""
+
+
+def is_logged(trainer: lightning.Trainer, step: int) -> bool:
+    """Whether a step is one of those whose values are logged; reading them in others would only make it wait for a GPU."""
+    every: int = trainer.log_every_n_steps  # pyright: ignore[reportAttributeAccessIssue]
+    return every > 0 and step % every == 0
+
+
+def timer_of(trainer: lightning.Trainer) -> Timer | None:
+    """The clock of a run with `trainer.max_time`."""
+    return next((each for each in trainer.callbacks if isinstance(each, Timer)), None)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @dataclass(frozen=True)
@@ -16,12 +37,22 @@ class Optimization:
     optimizer: Callable[..., torch.optim.Optimizer]
     """Called with the trained parameters."""
     scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None
-    """Called with the optimiser; it advances every step. None: a constant learning rate."""
+    """Called with the optimiser, and under `trainer.max_time` with `elapsed`, a function that gives the share of it that has
+    passed; it advances every step. None: a constant learning rate."""
     seed: int = 0
     """Seed of dropout and augmentation."""
 
 
-class Training(lightning.LightningModule):
+class _Compilable(type):
+    """Every training has the setting `compile`, which its constructor need not pass on."""
+
+    def __call__(cls, *arguments: Any, compile: bool | str = "auto", **settings: Any) -> Any:
+        made = super().__call__(*arguments, **settings)
+        made.compiles = compile
+        return made
+
+
+class Training(lightning.LightningModule, metaclass=_Compilable):
     """Optimises the "loss" that `measure` returns, and logs all of its values, in training and validation.
 
     By default the loss is the sum of `terms` times `loss_weights`; a term without a weight is only logged.
@@ -29,6 +60,8 @@ class Training(lightning.LightningModule):
 
     system: ClassVar[type | None] = None
     """The system that captures with the network; None: none does."""
+    compiles: bool | str
+    """Whether training steps are compiled: True, False or "auto" (`_is_compiled`)."""
     parts: ClassVar[tuple[str, ...]] = ()
     """Attributes that are constructor arguments of the system's pipeline."""
 
@@ -62,13 +95,32 @@ class Training(lightning.LightningModule):
                 part.eval()
         return self
 
+    def on_train_start(self) -> None:
+        """Compile `measure` for training steps, where that pays; validation's stays eager."""
+        self._measure, mode = self.measure, "reduce-overhead" if self.device.type == "cuda" else None
+        if self._is_compiled():  # a function: a compiled module would put every weight into checkpoints a second time
+            self._measure = torch.compile(self.measure, dynamic=False, mode=mode)
+
+    def _is_compiled(self) -> bool:
+        """Whether training steps are compiled. "auto": on a GPU, and on a CPU for runs of `WORTH_COMPILING` steps of networks
+        without dropout, whose random numbers cost compiled code more than it saves."""
+        require_choice(str(self.compiles).lower(), ("true", "false", "auto"), f"model.compile={self.compiles!r}")
+        dropout = any(isinstance(part, torch.nn.Dropout) and part.p > 0 for part in self.modules())
+        pays = self.device.type == "cuda" or (self.trainer.max_steps >= WORTH_COMPILING and not dropout)
+        if not (pays if self.compiles == "auto" else self.compiles):
+            return False
+        found = any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "clang++"))
+        if not found:
+            warnings.warn("no C++ compiler (g++, clang++ or $CXX): training steps are not compiled", stacklevel=2)
+        return found
+
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Make dropout and augmentation of a step a function of seed and step, so that resumed runs repeat it."""
         torch.manual_seed((self.optimization.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def training_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> Tensor:
-        measured = self.measure(batch)
-        if (self.global_step + 1) % max(1, self.trainer.log_every_n_steps) == 0:
+        measured = self._measure(batch)
+        if is_logged(self.trainer, self.global_step + 1) or timer_of(self.trainer):  # whose last step is logged, too
             values = {f"train/{name}": value.detach().clone() for name, value in measured.items()}
             self.log_dict(values, batch_size=len(batch[0]), prog_bar=True)
         return measured["loss"]
@@ -83,4 +135,10 @@ class Training(lightning.LightningModule):
         optimizer._step_supports_amp_scaling = False  # pyright: ignore[reportAttributeAccessIssue]
         if (scheduler := self.optimization.scheduler) is None:
             return optimizer
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler(optimizer), "interval": "step"}}
+        more = {"elapsed": partial(self._elapsed, timer)} if (timer := timer_of(self.trainer)) else {}
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler(optimizer, **more), "interval": "step"}}
+
+    def _elapsed(self, timer: Timer) -> float:
+        """Share of `trainer.max_time` that has passed, with earlier starts of the run: the same in all processes."""
+        passed = timer.time_elapsed()
+        return self.trainer.strategy.broadcast(passed / max(passed + (timer.time_remaining() or 0.0), 1e-9))

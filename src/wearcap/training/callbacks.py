@@ -1,27 +1,28 @@
 """Callbacks, which observe a training run and do not change it."""
 
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import lightning
 import torch
 from lightning.pytorch import Callback
 from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
-from lightning.pytorch.utilities.types import STEP_OUTPUT
 from rich.progress import TaskID
 
 from wearcap.metrics.table import aggregate
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import first_seconds
 from wearcap.runtime.system import CaptureInput, Refine, System
-from wearcap.training.base import Training
+from wearcap.training.base import Training, is_logged, timer_of
 
 
 def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
     """Whether a callback that runs at every n-th and at the last validation is due now, in this process."""
     last = trainer.max_steps > 0 and trainer.global_step >= trainer.max_steps
-    due = last or (trainer.current_epoch + 1) % every_n_epochs == 0
+    due = last or trainer.should_stop or (trainer.current_epoch + 1) % every_n_epochs == 0
     return due and trainer.is_global_zero and not trainer.sanity_checking
 
 
@@ -77,14 +78,12 @@ class CaptureValidation(Callback):
 
 
 class MovingAverage(WeightAveraging):
-    """An exponential moving average of the weights, in one operation for all of them and without waiting for a GPU.
+    """An exponential moving average of the weights, which a step updates in one operation without waiting for a GPU.
 
-    Lightning's own averages them on the CPU if they move to a GPU after its `setup`, and asks the GPU in each step whether it
-    is the first.
+    Lightning's own stays on the CPU when the weights go to a GPU, and asks the GPU in each step whether it is the first.
     """
 
-    state_key = "EMAWeightAveraging"  # pyright: ignore[reportAssignmentType]
-    """As in checkpoints that were written with Lightning's."""
+    state_key = "EMAWeightAveraging"  # pyright: ignore[reportAssignmentType]  # as in checkpoints with Lightning's
 
     def __init__(self, decay: float, use_buffers: bool = False):
         """`decay`: share of the average that a step keeps. Buffers are copied, or averaged, too (`use_buffers`)."""
@@ -95,28 +94,84 @@ class MovingAverage(WeightAveraging):
         self._device = trainer.strategy.root_device
         super().setup(trainer, pl_module, stage)
 
-    def on_train_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        outputs: STEP_OUTPUT,
-        batch,
-        batch_idx: int,
-    ) -> None:
+    @torch.no_grad()
+    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module, outputs, batch, batch_idx: int) -> None:
         if trainer.global_step == self._latest_update_step or self._average_model is None:
             return
-        first, self._latest_update_step = self._latest_update_step == 0, trainer.global_step
-        averaged = self._average_model.module
-        pairs = [*zip(averaged.parameters(), pl_module.parameters())]
-        copied = [*zip(averaged.buffers(), pl_module.buffers())]
-        if self._use_buffers:
-            pairs += [pair for pair in copied if pair[0].is_floating_point()]
-            copied = [pair for pair in copied if not pair[0].is_floating_point()]
-        with torch.no_grad():
-            torch._foreach_lerp_(*map(list, zip(*pairs)), 1.0 if first else 1 - self.decay)
-            if copied:
-                torch._foreach_copy_(*map(list, zip(*copied)))
-            self._average_model.n_averaged += 1
+        share = 1 - self.decay if self._latest_update_step else 1.0
+        self._latest_update_step, average = trainer.global_step, self._average_model.module
+        torch._foreach_lerp_([*average.parameters()], [*pl_module.parameters()], share)
+        for old, new in zip(average.buffers(), pl_module.buffers()):
+            old.lerp_(new, share) if self._use_buffers and old.is_floating_point() else old.copy_(new)
+        self._average_model.n_averaged += 1
+
+
+def steps_of_run(trainer: lightning.Trainer) -> float:
+    """The run's steps: `max_steps`, or those of `max_epochs` (infinite without either)."""
+    if trainer.max_steps > 0:
+        return trainer.max_steps
+    epochs = trainer.max_epochs
+    per_epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+    return epochs * per_epoch if epochs is not None and epochs > 0 else math.inf
+
+
+class Speed(Callback):
+    """Shows windows per second, the share of time that steps wait for them and minutes to the end of the run; logs them at every
+    validation (`speed/…`), of the steps since the one before but for the first.
+
+    A wait is from a step's end to the next one's batch, in a GPU's own time, which is read when the GPU has come past it.
+    """
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self._start = time.perf_counter(), trainer.global_step
+        self.on_validation_end(trainer, pl_module)
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self._waits: list[tuple[Any, Any]] = []
+        self._steps: list[tuple[float, int]] = []  # when they ended, and their windows
+
+    def on_train_batch_start(self, trainer: lightning.Trainer, pl_module, batch, batch_idx: int) -> None:
+        if self._steps:
+            self._waits.append((self._ended, _mark(pl_module.device)))
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, pl_module, outputs, batch, batch_idx: int) -> None:
+        self._steps.append((time.perf_counter(), len(batch[0]) * trainer.world_size))
+        self._ended = _mark(pl_module.device)
+        if is_logged(trainer, trainer.global_step) and len(self._steps) > 1:
+            pl_module.log_dict(self._values(trainer), prog_bar=True, logger=False)
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        if len(self._steps) > 1:
+            values = {f"speed/{name}": value for name, value in self._values(trainer).items()}
+            pl_module.log_dict(values, rank_zero_only=True)
+
+    def _values(self, trainer: lightning.Trainer) -> dict[str, float]:
+        seconds, pace = self._steps[-1][0] - self._steps[0][0], time.perf_counter() - self._start[0]
+        left = pace / (trainer.global_step - self._start[1]) * (steps_of_run(trainer) - trainer.global_step)
+        if (timer := timer_of(trainer)) is not None:
+            left = min(left, timer.time_remaining() or 0.0)
+        values = {
+            "windows_per_s": sum(windows for _, windows in self._steps[1:]) / seconds,
+            "waiting": sum(_seconds(*wait) for wait in self._waits) / seconds,
+            "minutes_left": max(0.0, left / 60),
+        }
+        return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+def _mark(device: torch.device) -> Any:
+    """A point in time: an event in a GPU's queue, or this process's clock (s)."""
+    if device.type != "cuda":
+        return time.perf_counter()
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
+
+
+def _seconds(start: Any, end: Any) -> float:
+    """Seconds between two marks; 0 until a GPU has come past them."""
+    if isinstance(end, float):
+        return end - start
+    return start.elapsed_time(end) / 1000 if end.query() else 0.0
 
 
 class StepsProgressBar(RichProgressBar):
@@ -124,12 +179,8 @@ class StepsProgressBar(RichProgressBar):
 
     @property
     def total_train_batches(self) -> int | float:
-        """The run's steps: `max_steps`, or those of `max_epochs` (infinite without either)."""
-        if self.trainer.max_steps > 0:
-            return self.trainer.max_steps
-        epochs = self.trainer.max_epochs
-        per_epoch = math.ceil(self.trainer.num_training_batches / self.trainer.accumulate_grad_batches)
-        return epochs * per_epoch if epochs is not None and epochs > 0 else math.inf
+        """The run's steps."""
+        return steps_of_run(self.trainer)
 
     def on_train_epoch_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Begin the bar in the first epoch; in later ones only their number changes."""
@@ -146,8 +197,8 @@ class StepsProgressBar(RichProgressBar):
         super()._update(progress_bar_id, steps, visible, hard)
 
     def _update_metrics(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Show metrics when they are logged: reading them in every step would make it wait for a GPU."""
-        if trainer.global_step % max(1, trainer.log_every_n_steps) == 0:
+        """Show metrics when they are logged."""
+        if is_logged(trainer, trainer.global_step):
             super()._update_metrics(trainer, pl_module)
 
     def _get_train_description(self, current_epoch: int) -> str:

@@ -34,7 +34,7 @@ from wearcap.training.base import Training
 from wearcap.version import __version__
 
 FREE_TO_CHANGE = (
-    *("paths.", "resume.", "init.", "test.", "logger.", "early_stop.", "callbacks.progress."),
+    *("paths.", "resume.", "init.", "test.", "logger.", "early_stop.", "callbacks.progress.", "model.compile."),
     *(
         f"trainer.{name}."
         for name in ("accelerator", "default_root_dir", "enable_model_summary", "enable_progress_bar")

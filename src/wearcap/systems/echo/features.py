@@ -152,21 +152,21 @@ class EchoFeatures:
 
     def encode_body(self, body: Body, frame: Rigid) -> Float[Tensor, "batch time human"]:
         """Root translation and 6D joint rotations, with the root's pose in coordinates of `frame`."""
-        root = frame.inverse() @ Rigid(body.R_parent_joint[:, :, 0], body.t_world_root)
+        root = frame.inverse().chain(Rigid(body.R_parent_joint[:, :, 0], body.t_world_root))
         R = torch.cat([root.R[:, :, None], body.R_parent_joint[:, :, 1:]], 2)
         return torch.cat([root.t, rotation.rot6d_from_matrix(R).flatten(-2)], -1)
 
     def decode_body(self, human: Float[Tensor, "batch time human"], frame: Rigid) -> Body:
         """The inverse of `encode_body`."""
         R = rotation.matrix_from_rot6d(human[..., 3:].unflatten(-1, (-1, 6)))
-        root = frame @ Rigid(R[:, :, 0], human[..., :3])
+        root = frame.chain(Rigid(R[:, :, 0], human[..., :3]))
         return Body(torch.cat([root.R[:, :, None], R[:, :, 1:]], 2), root.t)
 
     def encode_object(self, T_world_object: Rigid, frame: Rigid) -> Float[Tensor, "batch time 9"]:
         """Translation and 6D rotation of an object in coordinates of `frame`."""
-        T = frame.inverse() @ T_world_object
+        T = frame.inverse().chain(T_world_object)
         return torch.cat([T.t, rotation.rot6d_from_matrix(T.R)], -1)
 
     def decode_object(self, value: Float[Tensor, "batch time 9"], frame: Rigid) -> Rigid:
         """The inverse of `encode_object`."""
-        return frame @ Rigid(rotation.matrix_from_rot6d(value[..., 3:]), value[..., :3])
+        return frame.chain(Rigid(rotation.matrix_from_rot6d(value[..., 3:]), value[..., :3]))

@@ -129,8 +129,8 @@ class EchoDenoiser(nn.Module):
 
     def per_feature(self, level: Float[Tensor, "batch time modality"]) -> Float[Tensor, "batch time feature"]:
         """Each modality's level, repeated for its features."""
-        sizes = torch.tensor(self.sizes, device=level.device)
-        return level.repeat_interleave(sizes, -1, output_size=sum(self.sizes))
+        parts = zip(level.split(1, -1), self.sizes)
+        return torch.cat([part.expand(*level.shape[:-1], size) for part, size in parts], -1)
 
     def graphs(self) -> dict[str, Graph]:
         """The parts as graphs of full windows, whose padding frames are not `valid`.

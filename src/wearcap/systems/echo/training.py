@@ -42,8 +42,9 @@ class EchoDiffusion(Training):
     be known (`training_windows.canonical`), unless clean frames show another.
     """
 
+    _feet: Tensor
+
     system = Echo
-    """The system that captures with the network."""
 
     def __init__(
         self,
@@ -68,7 +69,10 @@ class EchoDiffusion(Training):
         self.encoder = None if encoder is None else encoder.requires_grad_(False).eval()
         self.features, self.schedule, self.skeleton, self.mix = features, schedule, skeleton, levels
         self.contacts = contacts
-        self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        self.register_buffer(
+            "_feet", torch.tensor(feet), persistent=False
+        )  # as a list it would go to a GPU in each step
 
     def pipeline_parts(self) -> dict[str, EchoModel]:
         parts = self.net, self.features, self.schedule, self.skeleton, self.encoder, self.contacts
@@ -144,16 +148,16 @@ class EchoDiffusion(Training):
 
     def terms(self, batch: EchoWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
-        frame = self.features.canonical(batch.points)
-        levels = self.levels(batch)
-        batch = self.knowable(batch, levels)
-        x0 = self.truth(batch, frame)
-        x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
-        condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
+        with losses.exact(batch.valid):
+            frame = self.features.canonical(batch.points)
+            levels = self.levels(batch)
+            batch = self.knowable(batch, levels)
+            x0 = self.truth(batch, frame)
+            x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
+            condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
         encoded = self.net.encode(condition, self.net.object(batch.object_code), batch.has_object, batch.valid)
         x0_hat = self.net(x_t, levels, encoded, batch.valid).float()
-        # Half precision is too coarse for millimetres.
-        with torch.autocast(x0_hat.device.type, enabled=False):
+        with losses.exact(x0):
             square = (x0_hat - x0).square() * self._counts(batch)
             weight = batch.valid.float()
             terms = {
@@ -200,7 +204,7 @@ class EchoDiffusion(Training):
             if at >= len(self.features.points):
                 continue
             T_wrist_world = Rigid(batch.R_world_point[:, :, at], batch.t_world_point[:, :, at]).inverse()
-            found, true = T_wrist_world @ T_world_object, T_wrist_world @ batch.T_world_object
+            found, true = map(T_wrist_world.chain, (T_world_object, batch.T_world_object))
             turn, shift = (self.features.fps * (a - b).diff(dim=1) for a, b in ((found.R, true.R), (found.t, true.t)))
             square = _mean_square(turn, shift, batch.object_mean[:, 1:], batch.object_spread[:, 1:])
             same = (batch.object_mean[:, 1:] == batch.object_mean[:, :-1]).all(-1)

@@ -66,6 +66,7 @@ class MotionDiffusion(Training):
     """
 
     system = HMD2
+    _feet: Tensor
 
     def __init__(
         self,
@@ -78,7 +79,6 @@ class MotionDiffusion(Training):
         loss: Loss,
         optimization: Optimization,
         conditions: Mapping[str, Mapping[str, Any]] | None = None,
-        compile: bool = False,
     ):
         """`conditions`: settings of those of `CONDITIONS` that the network has beside the head's path, by name."""
         super().__init__(optimization, loss.weights)
@@ -93,10 +93,8 @@ class MotionDiffusion(Training):
             if condition.weights is not None:
                 self.add_module(condition.weights, condition.encoder)
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
-        self._feet = [skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")]
-        # Methods, since compiled modules would put every weight into checkpoints a second time.
-        self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
-        self._encode = torch.compile(self.net.encode) if compile else self.net.encode
+        feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        self.register_buffer("_feet", torch.tensor(feet), persistent=False)
 
     def pipeline_parts(self) -> dict[str, DiffusionModel]:
         parts = self.features, self.schedule, self.skeleton, self.fps, self.given
@@ -137,26 +135,33 @@ class MotionDiffusion(Training):
 
     def _predicted(self, batch: HeadWindow, x0: Tensor) -> Tensor:
         """x̂0 of a batch in normalised motion space; half the windows are self-conditioned on a first estimate."""
-        encoded = self._encode(self.conditions(batch), batch.valid)
+        with losses.exact(x0):
+            conditions = self.conditions(batch)
+        encoded = self.net.encode(conditions, batch.valid)
         level = self.levels.of(batch.level)
         x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
         if not self.net.self_conditioning:
-            return self._denoise(x_t, level, encoded, batch.valid)
+            return self.net(x_t, level, encoded, batch.valid)
         with torch.no_grad():
-            guess = self._denoise(x_t, level, encoded, batch.valid)
+            guess = self.net(x_t, level, encoded, batch.valid)
         last = guess * (batch.chance[:, -1] < 0.5)[:, None, None]
-        return self._denoise(x_t, level, encoded, batch.valid, last)
+        return self.net(x_t, level, encoded, batch.valid, last)
 
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
+        with losses.exact(batch.t_world_head):
+            motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+            x0 = self.net.motion_normalizer(motion)
+        x0_hat = self._predicted(batch, x0)
+        with losses.exact(x0):
+            return self._errors(x0_hat.float(), x0, batch)
+
+    def _errors(self, x0_hat: Tensor, x0: Tensor, batch: HeadWindow) -> dict[str, Tensor]:
         valid = batch.valid  # padding weighs nothing
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
         weight = valid * (1 + self.loss.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
-        motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
-        x0 = self.net.motion_normalizer(motion)
-        x0_hat = self._predicted(batch, x0)
         terms = {"motion": losses.motion_mse(x0_hat, x0, weight)}
         if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate", "contact")):
-            motion_hat = self.net.motion_normalizer.inverse(x0_hat.float())
+            motion_hat = self.net.motion_normalizer.inverse(x0_hat)
             R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
             # As anchoring the body to the true head gives them.
             predicted, true = (batch.joints_from_head(self.skeleton, R) for R in (R_hat, batch.R_parent_joint))

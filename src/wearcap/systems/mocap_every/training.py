@@ -12,7 +12,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
-from wearcap.systems.mocap_every.model import TrainedEstimator
+from wearcap.systems.mocap_every.model import Estimate, TrainedEstimator
 from wearcap.systems.mocap_every.pipeline import MocapEvery, WatchModel
 from wearcap.systems.mocap_every.training_windows import WatchWindow
 from wearcap.training import losses
@@ -28,6 +28,8 @@ class WatchRegression(Training):
     """
 
     _joint_weights: Tensor
+    _ends: Tensor
+    _feet: Tensor
 
     system = MocapEvery
 
@@ -48,8 +50,9 @@ class WatchRegression(Training):
         self.net = net(feature_size=features.size, motion_size=features.motion_size)
         self.features, self.skeleton, self.fps = features, skeleton, fps
         self.contact_share = contact_share
-        self._ends = skeleton.indices(*ENDS)
-        self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+        self.register_buffer("_ends", torch.tensor(skeleton.indices(*ENDS)), persistent=False)
+        self.register_buffer("_feet", torch.tensor(feet), persistent=False)
         weights = torch.ones(len(skeleton))
         weights[self._ends] = end_weight
         self.register_buffer("_joint_weights", weights / weights.mean(), persistent=False)
@@ -89,8 +92,13 @@ class WatchRegression(Training):
         return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[:, :, None]
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
-        features, true, canonical = self._inputs(batch)
+        with losses.exact(batch.t_world_root):
+            features, true, canonical = self._inputs(batch)
         output = self.net(features)
+        with losses.exact(batch.t_world_root):
+            return self._errors(output, true, canonical, batch)
+
+    def _errors(self, output: Estimate, true: Tensor, canonical: Rigid, batch: WatchWindow) -> dict[str, Tensor]:
         last = output.motion.shape[1]
         motion, true, contact = output.motion.float(), true[:, -last:], batch.foot_contact[:, -last:]
         every = torch.ones_like(contact[..., 0])
