@@ -22,7 +22,7 @@ from wearcap.models.checkpoint import read_checkpoint
 from wearcap_testing import small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
-NAME, STEP = "motion_diffusion_head", 8 * 240
+NAME, STEP, STEPS = "motion_diffusion_head", 8 * 240, 60
 SMALL = [f"model.net.transformer.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
 QUIET = [
     "data.dataset.window=60",
@@ -43,7 +43,7 @@ def datasets(tmp_path_factory) -> Path:
 
 def given(datasets: Path, runs: Path, *more: str) -> list[str]:
     overrides = [f"paths.datasets={datasets}", "trainer.precision=32-true", *SMALL, *QUIET]
-    return ["hmd2", "--only", NAME, "--runs", str(runs), "--budget", str(24 * STEP), *more, "--overrides", *overrides]
+    return ["hmd2", "--only", NAME, "--runs", str(runs), "--budget", str(STEPS * STEP), *more, "--overrides", *overrides]
 
 
 def finish(arguments: list[str]) -> object:
@@ -83,7 +83,7 @@ def test_rates_are_swept_the_best_trained_and_what_is_finished_left_alone(datase
         took = tabling.training_of(str(best))
         assert took["rate_swept"].mean == 0.003
         assert str(took["rate_swept"]) == "0.0030"
-        assert 0 < took["frames_seen_m"].mean <= 24 * 8 * 60 / 1e6
+        assert 0 < took["frames_seen_m"].mean <= STEPS * 8 * 60 / 1e6
     assert not (tmp_path / NAME / "sweep").exists()
 
 
@@ -96,7 +96,7 @@ def test_a_killed_training_goes_on_where_it_was(datasets, tmp_path, monkeypatch)
     def killed(trainer, module, *rest, **named):
         class Kill(lightning.Callback):
             def on_train_batch_end(self, trainer, *_):
-                if trainer.global_step == 9:
+                if trainer.global_step == 25:
                     raise KeyboardInterrupt("killed")
 
         trainer.callbacks.append(Kill())
@@ -110,7 +110,7 @@ def test_a_killed_training_goes_on_where_it_was(datasets, tmp_path, monkeypatch)
     assert not json.loads((tmp_path / NAME / "rate.json").read_text())["finished"]
     assert finish(arguments) == 0
     config, _ = read_checkpoint(tmp_path / NAME / "checkpoints" / "last.ckpt")
-    assert config["training"]["steps"] == 24
+    assert config["training"]["steps"] == STEPS
     note = json.loads((tmp_path / NAME / "rate.json").read_text())
     assert note["losses"] == {}, "one rate needs no sweep"
     assert "rate_swept" not in tabling.training_of(str(tmp_path / NAME / "checkpoints" / "best.ckpt"))

@@ -11,7 +11,7 @@ import torch
 from benchmarks.rivals import SEARCH
 from benchmarks.tables import echo
 from benchmarks.tables import echo_rows as rows
-from carried_box import WINDOW, carried_dataset, carrying, small_features, small_net
+from carried_box import WINDOW, boxes, carried_dataset, carrying, small_features, small_net
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
 from wearcap.data.windows import Source, Windows
@@ -26,6 +26,7 @@ from wearcap.models.layers import TransformerSize
 from wearcap.recording import RecordingStore
 from wearcap.systems.echo.features import HANDS, OBJECT_SIZE, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.observations import ObjectReader
 from wearcap.systems.echo.scores import score_echo
 from wearcap.systems.echo.training import SLOPE, STANDING, EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
@@ -122,8 +123,8 @@ def test_the_truth_costs_nothing(data, people, frame):
 @pytest.mark.parametrize("frame", ["own", "window"])
 def test_the_vertex_term_is_the_mean_over_the_points(data, frame):
     system = oracle(frame)
-    windows, source = batch(system.features, data), dataset(system.features, data)
-    cloud = source.track(0).objects[0].cloud
+    windows = batch(system.features, data)
+    cloud = ObjectReader(system.features, None)(boxes().objects[0]).cloud
     at = system.features.canonical(windows.points)
     outputs = system.truth(windows, at)
     turn = rotation.exp(0.7 * torch.randn(*windows.valid.shape, 3))

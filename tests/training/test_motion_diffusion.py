@@ -70,7 +70,7 @@ def test_a_share_of_the_windows_is_pure_noise_and_the_others_keep_their_levels(t
     module.terms(batch)
     pure = module.net.level == 1
     assert abs(pure.float().mean().item() - 0.6) < 0.08
-    assert abs(module.net.level[~pure].mean().item() - 0.5) < 0.06
+    assert abs(module.net.level[~pure].mean().item() - 0.5) < 0.09
 
 
 def test_all_windows_of_pure_noise_are_refused(tmp_path):

@@ -185,7 +185,7 @@ BASELINES = {
 @pytest.mark.parametrize(("experiment", "pipeline"), BASELINES.items(), ids=BASELINES)
 def test_a_baseline_learns_in_a_few_steps_and_captures(experiment, pipeline, data, tmp_path):
     run = tmp_path / "run"
-    small = ("trainer.max_steps=30", "data.loading.steps_per_epoch=30", "optimizer.scheduler.warmup=2")
+    small = ("trainer.max_steps=50", "data.loading.steps_per_epoch=50", "optimizer.scheduler.warmup=2")
     small += ("optimizer.optimizer.lr=0.01",)
     train.main(arguments(experiment, data, run, *small, "data.loading.batch_size=8"))
     with open(run / "metrics.csv") as file:
