@@ -85,7 +85,7 @@ class WindowsModule(lightning.LightningDataModule):
 
         def numbered(step: int) -> tuple[Tensor, Tensor]:
             """Windows and seeds of a step: ranks take turns in one sequence, which goes on from epoch to epoch."""
-            fixed = trainer is not None and trainer.overfit_batches > 0
+            fixed = trainer is not None and trainer.overfit_batches > 0  # pyright: ignore[reportAttributeAccessIssue]
             epoch = 0 if trainer is None or fixed else trainer.current_epoch
             first = (epoch * steps + step) * size * world + rank
             numbers = (seed << 40) + first + world * torch.arange(size, device=upto.device)

@@ -27,18 +27,20 @@ class Draws:
     def __init__(self, seed: Int64[Tensor, "batch"]):
         self.seed = _mixed(seed * _GOLDEN)
 
-    def _key(self, name: str) -> Int64[Tensor, "batch"]:
-        return _mixed(self.seed ^ zlib.crc32(name.encode()))
-
     def _bits(self, name: str, count: int) -> Int64[Tensor, "batch draw"]:
         """64 random bits for each number."""
-        steps = torch.arange(1, count + 1, device=self.seed.device) * _GOLDEN
-        return _mixed(self._key(name)[:, None] + steps)
+        key = _mixed(self.seed ^ _number(name))[:, None]
+        return _mixed(key + torch.arange(1, count + 1, device=self.seed.device) * _GOLDEN)
 
     def uniform(self, name: str, *shape: int) -> Float[Tensor, "batch *shape"]:
         """Uniform numbers in [0, 1)."""
-        bits = self._bits(name, torch.Size(shape).numel())
-        return (((bits >> 40) & 0xFFFFFF).float() * 2.0**-24).reshape(-1, *shape)
+        count = torch.Size(shape).numel()
+        if self.seed.device.type == "cpu":
+            found = torch.empty(len(self.seed), count)
+            kernels.uniforms(self.seed.numpy(), _number(name), found.numpy())
+        else:
+            found = ((self._bits(name, count) >> 40) & 0xFFFFFF).float() * 2.0**-24
+        return found.reshape(-1, *shape)
 
     def share(self, name: str) -> Float64[Tensor, "batch"]:
         """Uniform numbers in [0, 1) of double precision, to choose among many."""
@@ -50,10 +52,15 @@ class Draws:
         table, words = _quantiles(self.seed.device), -(-count // 4)
         if self.seed.device.type == "cpu":
             found = torch.empty(len(self.seed), 4 * words)
-            kernels.normals(self._key(name).numpy(), table.numpy(), found.numpy())
+            kernels.normals(self.seed.numpy(), _number(name), table.numpy(), found.numpy())
         else:
             found = table[self._bits(name, words).view(torch.int16).long()]
         return found[:, :count].reshape(-1, *shape)
+
+
+@cache
+def _number(name: str) -> int:
+    return zlib.crc32(name.encode())
 
 
 def _mixed(bits: Int64[Tensor, "*batch"]) -> Int64[Tensor, "*batch"]:

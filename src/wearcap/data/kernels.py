@@ -1,6 +1,6 @@
 """Random numbers and rotations of many windows in one pass over memory: loops compiled for the CPU.
 
-`draws.Draws.normal`, `batch.between` and `batch.matrices` have the same in tensor operations, for other devices. Inner loops run over
+`draws.Draws`, `batch.between` and `batch.matrices` have the same in tensor operations, for other devices. Inner loops run over
 joints that lie side by side in memory, which compilers turn into vector instructions.
 """
 
@@ -9,17 +9,34 @@ import numpy as np
 from wearcap.geometry.compiled import compiled
 
 
-def _normals(keys, table, found):
-    """Four normal numbers of every 64 bits, as `Draws.normal` describes them; `found` "batch number", a multiple of four."""
-    golden, first, second = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-    low = np.uint64(0xFFFF)
-    for window in range(len(keys)):
-        state, row = np.uint64(keys[window]), found[window]
+def _mixed(bits):
+    """SplitMix64's output function, as `draws._mixed`."""
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))
+
+
+mixed = compiled(_mixed, inline="always")
+
+
+def _uniforms(seeds, name, found):
+    """Uniform numbers of 24 bits, as `Draws.uniform`: one of every 64 bits; `found` "batch number"."""
+    golden = np.uint64(0x9E3779B97F4A7C15)
+    for window in range(len(seeds)):
+        state, row = mixed(np.uint64(seeds[window]) ^ np.uint64(name)), found[window]
+        for place in range(len(row)):
+            state += golden
+            row[place] = np.float32(mixed(state) >> np.uint64(40)) * np.float32(2.0**-24)
+
+
+def _normals(seeds, name, table, found):
+    """Four normal numbers of every 64 bits, as `Draws.normal`; `found` "batch number", a multiple of four."""
+    golden, low = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xFFFF)
+    for window in range(len(seeds)):
+        state, row = mixed(np.uint64(seeds[window]) ^ np.uint64(name)), found[window]
         for place in range(len(row) // 4):
             state += golden
-            bits = (state ^ (state >> np.uint64(30))) * first
-            bits = (bits ^ (bits >> np.uint64(27))) * second
-            bits ^= bits >> np.uint64(31)
+            bits = mixed(state)
             row[4 * place] = table[np.intp(bits & low)]
             row[4 * place + 1] = table[np.intp((bits >> np.uint64(16)) & low)]
             row[4 * place + 2] = table[np.intp((bits >> np.uint64(32)) & low)]
@@ -77,6 +94,7 @@ def _matrices(quaternions, low, high, share, twins, mirrored, found):
                     row[entry] = R[entry, j]
 
 
+uniforms = compiled(_uniforms)
 normals = compiled(_normals)
 between = compiled(_between)
 matrices = compiled(_matrices)

@@ -32,6 +32,8 @@ MIN_SCALE = 0.05
 """Smallest standard deviation that features are divided by: rotations that hardly vary would become mostly noise."""
 ARM_VERSIONS = 3
 """Number of tracks of a recording with the arms of others (`OtherBodies.arms`)."""
+ARM_FRAMES = 240_000
+"""About the most frames of a data set that arms are taken from; of larger ones, recordings evenly chosen."""
 
 
 @dataclass(frozen=True)
@@ -252,7 +254,9 @@ class _Kept:
         return self.content.track(each.store, each.name, recording, each.rate)
 
     def _arms_in(self, root: Path) -> ArmDonors:
-        return ArmDonors([each.file for each in self.donors if each.store.root == root])
+        donors = [each for each in self.donors if each.store.root == root]
+        frames = sum(each.store.entries[each.name].frames for each in donors)
+        return ArmDonors([each.file for each in donors[:: 1 + frames // ARM_FRAMES]])
 
 
 def _of_wearer(track: Track, parts: frozenset[str]) -> Track:

@@ -38,7 +38,7 @@ class PoseNoise:
         """With rotation vectors (rad) of each window's "error"; the slow noise changes within a second."""
         frames, joints = batch.values["R_parent_joint"].shape[1:3]
         size, *shares = batch.draws.uniform("pose noise", 4, 1, 1).unbind(1)
-        scale = math.radians(self.largest_deg) * size / (3 * sum(share.square() for share in shares)).sqrt()
+        scale = math.radians(self.largest_deg) * size / (3 * torch.stack(shares).square().sum(0)).sqrt()
         knots = batch.draws.normal("slow noise", 2 + frames // 60, 3 * joints)
         place = torch.linspace(0, knots.shape[1] - 1, frames, device=batch.device)
         below = place.long().clamp(max=knots.shape[1] - 2)
