@@ -145,7 +145,7 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "pose_regressor_hands": (ONE, "data.dataset.window=120"),
     "motion_manifold": (ONE, TWO, THREE, VAL),
     "motion_autoencoder": (ONE, TWO),
-    "voxel_autoencoder": (ONE, TWO, "data.dataset.window=120"),
+    "voxel_autoencoder": (ONE, TWO, "data.dataset.window=8"),
     "object_encoder": ("data.dataset.per_class={train: 2, val: 1}", "data.dataset.root=data/clouds"),
     "egoview": (ONE, TWO),
 }
