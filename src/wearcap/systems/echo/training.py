@@ -70,9 +70,8 @@ class EchoDiffusion(Training):
         self.features, self.schedule, self.skeleton, self.mix = features, schedule, skeleton, levels
         self.contacts = contacts
         feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
-        self.register_buffer(
-            "_feet", torch.tensor(feet), persistent=False
-        )  # as a list it would go to a GPU in each step
+        # A list of indices would go to a GPU in each step.
+        self.register_buffer("_feet", torch.tensor(feet), persistent=False)
 
     def pipeline_parts(self) -> dict[str, EchoModel]:
         parts = self.net, self.features, self.schedule, self.skeleton, self.encoder, self.contacts
