@@ -17,7 +17,8 @@ def test_a_number_depends_on_seed_name_and_place_alone(kind, shape):
     whole = getattr(Draws(seeds), kind)("a", *shape)
     assert whole.shape == (5, *shape)
     some = Draws(seeds[order])
-    some.normal("b", 4), some.uniform("c"), some.share("a")
+    for other in (some.normal, some.uniform):
+        other("b", 4)
     assert torch.equal(getattr(some, kind)("a", *shape), whole[order])
     assert torch.equal(getattr(Draws(seeds[1:2]), kind)("a", *shape), whole[1:2])
     more = getattr(some, kind)("a", 40)

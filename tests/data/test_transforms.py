@@ -193,34 +193,11 @@ def test_a_larger_world_has_a_larger_object(roots):
     torch.testing.assert_close(larger.t_world_object, 2 * plain.t_world_object)
 
 
-def test_a_larger_wearer_has_longer_limbs_and_a_lower_floor(roots):
-    plain, larger = (one(windows(roots, "hmd2", **more), 1) for more in ({}, {"s": by(scaled, 1.5)}))
-    torch.testing.assert_close(larger.size, 1.5 * plain.size)
-    torch.testing.assert_close(larger.t_world_head, 1.5 * plain.t_world_head)
-    torch.testing.assert_close(
-        larger.t_world_head[:, 2] - larger.floor_height, 1.5 * (plain.t_world_head[:, 2] - plain.floor_height)
-    )
-    torch.testing.assert_close(larger.R_parent_joint, plain.R_parent_joint)
-
-
 def test_codes_of_points_cannot_be_scaled(roots):
     data = windows(roots, "hmd2", scale=Scale())
     data.content.conditions = {"points": PlaceCodes("none")}
     with pytest.raises(WearcapError, match="codes of points cannot be scaled"):
         one(data, 0)
-
-
-@pytest.mark.parametrize("system", ["hmd2", "mocap_every", "echo", "motion_autoencoder"])
-def test_stretched_windows_stay_on_the_path(roots, system):
-    """Every position lies on the recording's path, between the two frames that the speed leads to."""
-    name = {"hmd2": "t_world_head", "motion_autoencoder": "joints", "echo": "t_world_point"}.get(system, "t_world_root")
-    stretched, plain = windows(roots, system, stretch=TimeStretch(1.25)), windows(roots, system)
-    speed = stretched.cut(numbers(0), numbers(5)).speed.item()
-    slow, true = (getattr(one(data, 0, 5), name) for data in (stretched, plain))
-    count = min(len(true) - 1, int((len(true) - 1) / speed))
-    at = speed * torch.arange(count)
-    low, share = at.long(), (at - at.long()).reshape(-1, *[1] * (true.ndim - 1))
-    torch.testing.assert_close(slow[:count], torch.lerp(true[low], true[low + 1], share), atol=1e-3, rtol=0)
 
 
 def test_dropped_frames_are_missing_in_what_was_sensed_alone(roots):
@@ -231,32 +208,6 @@ def test_dropped_frames_are_missing_in_what_was_sensed_alone(roots):
     assert changed <= {"R_world_head", "t_world_head", "floor_height", "floor_from_head"}
     head = dropped.R_world_head
     torch.testing.assert_close(head @ head.mT, torch.eye(3).expand_as(head), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize(("system", "name"), [("hmd2", "R_world_head"), ("echo", "R_world_point")])
-def test_errors_of_a_tracker_are_constant_and_leave_the_truth(roots, system, name):
-    plain, wrong = (one(windows(roots, system, **more), 1, 4) for more in ({}, {"e": SensorErrors(head_deg=3.0)}))
-    assert torch.equal(plain.R_parent_joint, wrong.R_parent_joint)
-    off = getattr(plain, name).mT @ getattr(wrong, name)
-    torch.testing.assert_close(off, off[:1].expand_as(off), atol=1e-5, rtol=0)
-    head = off[0] if system == "hmd2" else off[0, 0]
-    assert 0.1 < rotation.geodesic(head, torch.eye(3)).rad2deg() < 15
-    if system == "echo":
-        torch.testing.assert_close(off[:, 1:], torch.eye(3).expand_as(off[:, 1:]), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("system", ["hmd2", "echo"])
-def test_an_early_end_is_padding_and_a_still_start_is_not(roots, system):
-    name, chosen = "t_world_head" if system == "hmd2" else "t_world_point", (numbers(1).repeat(10), torch.arange(10))
-    ended = windows(roots, system, e=EarlyEnd(1.0, 4)).batch(*chosen)
-    begun = windows(roots, system, b=StillStart(1.0)).batch(*chosen)
-    for valid, part in zip(ended.valid, getattr(ended, name)):
-        last = int(valid.sum()) - 1
-        assert 3 <= last < len(valid) - 1
-        assert torch.equal(part[last:], part[last : last + 1].expand_as(part[last:]))
-    assert begun.valid.all()
-    still = (getattr(begun, name).flatten(2).diff(dim=1) == 0).all(-1).sum(1)
-    assert still.max() > begun.valid.shape[1] // 2
 
 
 def test_without_augmentation_transforms_do_nothing(roots):
