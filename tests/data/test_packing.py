@@ -100,15 +100,16 @@ def test_a_data_set_that_is_only_read_still_trains(tmp_path):
     assert (tmp_path / "read" / "cache").is_file()
 
 
-def test_only_the_newest_packings_are_kept(tmp_path):
+def test_the_packings_that_were_used_last_are_kept(tmp_path):
+    """Those of another training's start, and one's own, though it was made before all others."""
     small_dataset(tmp_path)
-    for age in range(KEPT + 2):
-        folder = tmp_path / "cache" / f"windows-old{age}"
-        folder.mkdir(parents=True)
+    windows(tmp_path)
+    (own,) = (tmp_path / "cache").glob("windows-*")
+    for age, folder in enumerate([*(own.with_name(f"windows-old{number}") for number in range(KEPT + 2)), own]):
+        folder.mkdir(exist_ok=True)
         os.utime(folder, (1e9 - age, 1e9 - age))
     (tmp_path / "cache" / "other").mkdir()
     windows(tmp_path)
-    names = {folder.name for folder in (tmp_path / "cache").iterdir()}
     old = {f"windows-old{age}" for age in range(KEPT - 1)}
-    assert len(names) == KEPT + 1
-    assert names > old | {"other"}
+    assert {folder.name for folder in (tmp_path / "cache").iterdir()} == old | {"other", own.name}
+    assert len(list(own.iterdir())) == 3
