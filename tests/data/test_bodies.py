@@ -1,10 +1,11 @@
 """Other people's bones in a recorded motion: as a skeleton with these bones would move, and for a share of the windows."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
+from benchmarks.rivals.single_windows import bodies as before
 from benchmarks.rivals.single_windows import echo_windows, head_windows, watch_windows
 from benchmarks.rivals.single_windows.bodies import OtherPerson, Proportions, with_proportions
 from benchmarks.rivals.single_windows.transforms import Cut
@@ -12,7 +13,15 @@ from carried_box import carrying
 from drawn_windows import numbers
 from wearcap.body.kinematics import forward_kinematics, site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
-from wearcap.data.bodies import PARTS, OtherBodies, bones_in_parts, places_in_parts, size_in_parts, with_bones
+from wearcap.data.bodies import (
+    PARTS,
+    OtherBodies,
+    bones_in_parts,
+    head_in_parts,
+    places_in_parts,
+    size_in_parts,
+    with_bones,
+)
 from wearcap.data.features import body_size
 from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
@@ -67,6 +76,9 @@ def test_parts_that_are_weighed_and_summed_are_a_body_with_these_bones(recording
     places = weighed(places_in_parts(motion, names))
     torch.testing.assert_close(places, other.T_world_joint.t, atol=1e-5, rtol=0)
     torch.testing.assert_close(places_in_parts(motion, names).sum(2), motion.T_world_joint.t, atol=1e-5, rtol=0)
+    off = 0.1 * torch.randn(len(motion), 3)  # the device sits on the head as it did
+    head = weighed(head_in_parts(motion, motion.joint("head").t + off))
+    torch.testing.assert_close(head, other.joint("head").t + off, atol=1e-5, rtol=0)
     torch.testing.assert_close(weighed(size_in_parts(motion.skeleton)), body_size(other.skeleton), atol=1e-5, rtol=0)
     skeleton = with_bones(motion.skeleton, TALL)
     assert skeleton.sites == other.skeleton.sites
@@ -121,8 +133,11 @@ def test_a_share_of_the_windows_is_of_others_and_the_rest_as_recorded(store, sys
             torch.testing.assert_close(getattr(batch, name)[~others], value[~others], atol=1e-5, rtol=0)
     many = varied.cut(numbers(0).repeat(4000), torch.arange(4000))
     assert many.others.double().mean().item() == pytest.approx(0.7, abs=0.03)
-    legs = many.bones[many.others, PARTS.index("legs")].log()
-    assert legs.std().item() == pytest.approx((0.05**2 + 0.03**2) ** 0.5, rel=0.06)
+    people = [before.OtherBodies(1).proportions(seed) for seed in range(3000)]
+    older = torch.tensor([list(asdict(each).values()) for each in people])
+    logs = (many.bones[many.others, 1:].log(), older.log())
+    torch.testing.assert_close(*(each.T.cov() for each in logs), atol=2.5e-4, rtol=0)
+    assert logs[0].mean(0).abs().max() < 0.004
     assert (many.bones[~many.others] == 1).all()
     assert (many.bones[:, PARTS.index("device")] == 1).all()
 
