@@ -23,9 +23,3 @@ def single(batch: Batch, number: int) -> Window:
     """A window of a batch that was read, as the transforms of before take it."""
     values = {name: value[number] for name, value in batch.values.items()}
     return Window(values, {name: order.tolist() for name, order in batch.twins.items()}, fps=batch.fps)
-
-
-def read(windows: Windows, index: int) -> dict[str, torch.Tensor]:
-    """The values of an unchanged window, by the names of its track."""
-    batch = windows.cut(numbers(index), numbers(0)).read()
-    return {name: value[0] for name, value in batch.values.items()}
