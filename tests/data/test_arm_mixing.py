@@ -8,7 +8,7 @@ import torch
 from wearcap.body.skeleton import xsens23
 from wearcap.data.arm_mixing import ARMS, ArmDonors
 from wearcap.data.bodies import OtherBodies
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import ARM_VERSIONS, Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
@@ -124,26 +124,29 @@ def test_windows_take_other_arms_for_a_share_of_the_others(tmp_path):
     twin = replace(recording, name="twin", motion=replace(recording.motion, R_parent_joint=R))
     store.add(twin, split="train", config_hash="test")
     settings = {"content": WatchContent(), "window": 40, "stride": 10, "fps": 30.0, "every": 2}
-    none, all_mixed = (
-        Windows([Source(str(store.root))], "train", True, bodies=OtherBodies(1, arms=arms), **settings)
-        for arms in (0.0, 1.0)
+    none, mixed = (
+        Windows([Source(str(store.root))], "train", True, bodies=OtherBodies(0.8, arms=arms), **settings)
+        for arms in (0.0, 0.5)
     )
-    own, own_too = none[0, 2], all_mixed[0, 2]
-    assert isinstance(own, WatchWindow)
-    assert isinstance(own_too, WatchWindow)
-    assert torch.equal(own.R_parent_joint, own_too.R_parent_joint)
-    legs = [joint for joint in range(23) if joint not in JOINTS]
-    before, after = none[0, 3], all_mixed[0, 3]
+    chosen = torch.zeros(400, dtype=torch.long), torch.arange(400)
+    before, after, cut = none.batch(*chosen), mixed.batch(*chosen), mixed.cut(*chosen)
     assert isinstance(before, WatchWindow)
     assert isinstance(after, WatchWindow)
-    assert torch.equal(before.R_parent_joint[:, legs], after.R_parent_joint[:, legs])
-    assert torch.equal(before.t_world_head, after.t_world_head)
-    assert rotation.geodesic(before.R_parent_joint, after.R_parent_joint)[:, JOINTS].max() > 0.3
-    assert not torch.allclose(before.R_world_wrist, after.R_world_wrist, atol=0.1)
+    moved = cut.track != mixed.starts[0, 0]
+    assert moved.double().mean().item() == pytest.approx(0.8 * 0.5, abs=0.06)
+    assert not (moved & ~cut.others).any()
+    counts = torch.bincount(cut.track[moved])
+    assert (counts > 0).sum() == ARM_VERSIONS  # each as often
+    assert counts[counts > 0].min() > 0.6 * moved.sum() / ARM_VERSIONS
+    assert torch.equal(before.R_parent_joint[~moved], after.R_parent_joint[~moved])
+    legs = [joint for joint in range(23) if joint not in JOINTS]
+    assert torch.equal(before.R_parent_joint[:, :, legs], after.R_parent_joint[:, :, legs])
+    torch.testing.assert_close(before.t_world_head, after.t_world_head, atol=1e-5, rtol=0)
+    turned = rotation.geodesic(before.R_parent_joint[moved], after.R_parent_joint[moved])[:, :, JOINTS]
+    assert turned.amax((1, 2)).min() > 0.3
+    assert (before.R_world_wrist - after.R_world_wrist)[moved].abs().max() > 0.1
 
 
 def test_a_share_is_a_share():
-    with pytest.raises(WearcapError, match="a share"):
-        OtherBodies(2, arms=1.5)
-    bodies = OtherBodies(2, arms=0.4)
-    assert sum(bodies.moves_other_arms(seed) for seed in range(2000)) / 2000 == pytest.approx(0.4, abs=0.04)
+    with pytest.raises(WearcapError, match="a share of the people, from 0 to 1"):
+        OtherBodies(0.5, arms=1.5)

@@ -1,17 +1,30 @@
-"""Other people's bones in a recorded motion: feet stay where they stand, the head device sits as it did, samples repeat."""
+"""Other people's bones in a recorded motion: as a skeleton with these bones would move, and for a share of the windows."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
-from wearcap.body.kinematics import site_positions
+from benchmarks.rivals.single_windows import bodies as before
+from benchmarks.rivals.single_windows import echo_windows, head_windows, watch_windows
+from benchmarks.rivals.single_windows.bodies import OtherPerson, Proportions, with_proportions
+from benchmarks.rivals.single_windows.transforms import Cut
+from carried_box import carrying
+from drawn_windows import numbers
+from wearcap.body.kinematics import forward_kinematics, site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
-from wearcap.data.bodies import OtherBodies, Proportions, with_proportions
+from wearcap.data.bodies import (
+    PARTS,
+    OtherBodies,
+    bones_in_parts,
+    head_in_parts,
+    places_in_parts,
+    size_in_parts,
+    with_bones,
+)
 from wearcap.data.features import body_size
-from wearcap.data.windows import Content, Source, Windows
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
-from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import RecordingStore
 from wearcap.systems.echo.features import EchoFeatures
 from wearcap.systems.echo.training_windows import EchoContent
@@ -19,7 +32,21 @@ from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap.systems.mocap_every.training_windows import WatchContent
 from wearcap_testing import small_dataset
 
-TALL = Proportions(legs=1.1, trunk=0.95, shoulders=1.05, upper_arms=0.9, forearms=1.2)
+TALL = torch.tensor([1.0, 1.1, 0.95, 1.05, 0.9, 1.2])
+"""Factors of `PARTS`."""
+CONTENTS = {
+    "hmd2": (HeadContent(), {"window": 60, "stride": 20, "fps": 60.0}),
+    "mocap_every": (WatchContent(), {"window": 40, "stride": 10, "fps": 30.0, "every": 2}),
+    "echo": (
+        EchoContent(EchoFeatures(classes=["box"], shape_size=0), None),
+        {"window": 30, "stride": 10, "fps": 30.0, "every": 2},
+    ),
+}
+BEFORE = {
+    "hmd2": head_windows.HeadContent(),
+    "mocap_every": watch_windows.WatchContent(),
+    "echo": echo_windows.EchoContent(EchoFeatures(classes=["box"], shape_size=0), None),
+}
 
 
 @pytest.fixture(scope="module")
@@ -32,101 +59,120 @@ def recording(store):
     return store.load(store.names("train")[0])
 
 
-def test_limbs_have_the_drawn_lengths_and_joints_turn_as_before(recording):
-    other = with_proportions(recording, TALL)
-    before, after = body_size(recording.motion.skeleton), body_size(other.motion.skeleton)
-    assert after[1] / before[1] == pytest.approx(1.1)
-    assert after[3] / before[3] == pytest.approx(0.95)
-    arms = recording.motion.skeleton.indices("left_elbow", "left_wrist")
-    upper, lower = recording.motion.skeleton.t_parent_joint[arms].norm(dim=1)
-    assert after[2] == pytest.approx((0.9 * upper + 1.2 * lower).item())
-    assert torch.equal(other.motion.R_parent_joint, recording.motion.R_parent_joint)
-    assert other.skeleton == other.motion.skeleton
+def windows(root, system: str, bodies: OtherBodies | None = None, augmented: bool = True, free: bool = True) -> Windows:
+    content, settings = CONTENTS[system]
+    sources = [Source(str(root), bodies=free)]
+    return Windows(sources, "train", augmented, content=content, bodies=bodies, **settings)
 
 
-def test_feet_stay_where_they_stand(recording):
-    """All that is below the hips is similar: patches of feet are in the old places times the legs' factor."""
-    other = with_proportions(recording, TALL)
-    patches = [
-        site_positions(each.motion.skeleton, each.motion.T_world_joint, FOOT_PATCHES) for each in (recording, other)
-    ]
-    torch.testing.assert_close(patches[1], 1.1 * patches[0], atol=1e-4, rtol=0)
+def weighed(parts: torch.Tensor, bones: torch.Tensor = TALL) -> torch.Tensor:
+    return (bones[:, None] * parts).sum(-2)
 
 
-def test_the_device_sits_on_the_head_as_it_did(recording):
-    other = with_proportions(recording, TALL)
-    seats = [each.head.t_world_device - each.motion.joint("head").t for each in (recording, other)]
-    torch.testing.assert_close(seats[1], seats[0], atol=1e-5, rtol=0)
-    assert not torch.allclose(other.head.t_world_device, recording.head.t_world_device, atol=0.01)
-    assert other.points is None
-    assert not other.imu
-
-
-def test_handled_objects_are_refused(recording):
-    handled = replace(
-        recording,
-        object_motion={
-            "box": Trajectory(recording.head.timestamps, recording.head.R_world_device, recording.head.t_world_device)
-        },
-    )
-    with pytest.raises(WearcapError, match="objects are handled"):
-        with_proportions(handled, TALL)
-
-
-def test_people_are_a_function_of_the_seed_and_spread_as_people_do():
-    bodies = OtherBodies(4)
-    assert bodies.proportions(7) == bodies.proportions(7)
-    legs = torch.tensor([bodies.proportions(seed).legs for seed in range(2000)]).log()
-    assert legs.std().item() == pytest.approx((0.05**2 + 0.03**2) ** 0.5, rel=0.1)
-    with pytest.raises(WearcapError, match="1 or more"):
-        OtherBodies(0)
-
-
-CONTENTS = {
-    "hmd2": (HeadContent(), {"window": 60, "stride": 20, "fps": 60.0}),
-    "mocap_every": (WatchContent(), {"window": 40, "stride": 10, "fps": 30.0, "every": 2}),
-    "echo": (
-        EchoContent(EchoFeatures(classes=["box"], shape_size=0), None),
-        {"window": 30, "stride": 10, "fps": 30.0, "every": 2},
-    ),
-}
+def test_parts_that_are_weighed_and_summed_are_a_body_with_these_bones(recording):
+    motion, other = recording.motion, with_proportions(recording, Proportions(*TALL[1:].tolist())).motion
+    torch.testing.assert_close(weighed(bones_in_parts(motion.skeleton)), other.skeleton.t_parent_joint)
+    names = motion.skeleton.joint_names
+    places = weighed(places_in_parts(motion, names))
+    torch.testing.assert_close(places, other.T_world_joint.t, atol=1e-5, rtol=0)
+    torch.testing.assert_close(places_in_parts(motion, names).sum(2), motion.T_world_joint.t, atol=1e-5, rtol=0)
+    off = 0.1 * torch.randn(len(motion), 3)  # the device sits on the head as it did
+    head = weighed(head_in_parts(motion, motion.joint("head").t + off))
+    torch.testing.assert_close(head, other.joint("head").t + off, atol=1e-5, rtol=0)
+    torch.testing.assert_close(weighed(size_in_parts(motion.skeleton)), body_size(other.skeleton), atol=1e-5, rtol=0)
+    skeleton = with_bones(motion.skeleton, TALL)
+    assert skeleton.sites == other.skeleton.sites
+    assert torch.equal(skeleton.t_parent_joint, other.skeleton.t_parent_joint)
 
 
 @pytest.mark.parametrize("system", CONTENTS)
-def test_windows_are_of_the_wearer_and_of_others_in_turn(store, system):
-    content, settings = CONTENTS[system]
-    assert isinstance(content, Content)
-    sources = [Source(str(store.root))]
-    varied = Windows(sources, "train", True, content=content, bodies=OtherBodies(3), **settings)
-    plain = Windows(sources, "train", True, content=content, **settings)
-    for person in range(4):
-        window, own = varied[0, 4 * 5 + person], plain[0, 4 * 5 + person]
-        assert torch.equal(window.R_parent_joint, own.R_parent_joint)
-        assert torch.equal(window.size, own.size) == (person == 0)
-    head = [
-        each.t_world_head if system != "echo" else each.t_world_point[:, 0] for each in (varied[0, 21], plain[0, 21])
-    ]
-    assert not torch.allclose(*head)
+def test_windows_of_others_are_cut_out_of_recordings_done_by_them(store, system):
+    """With the bones that were drawn, the whole recording is computed anew."""
+    data, count = windows(store.root, system, OtherBodies(1.0)), 6
+    index, seed = torch.arange(count) * (len(data) // count), torch.arange(count)
+    cut = data.cut(index, seed)
+    found, older, every = OtherBodies(1.0)(cut.read()).values, BEFORE[system], CONTENTS[system][1].get("every", 1)
+    assert cut.others.all()
+    for k in range(count):
+        person = OtherPerson(Proportions(*cut.bones[k, 1:].tolist()))
+        track = older.open(store, store.names("train")[cut.track[k]], every, person)
+        same = Cut(cut.start[k].item(), cut.count, data.packed.length[cut.track[k]].item(), step=cut.step)
+        for name, value in older.read(track, same, None).values.items():
+            if (system, name[:5]) != ("hmd2", "floor"):  # of another path there, not the scaled one of this
+                limit = 2e-3 if name.startswith(("acc", "R")) else 2e-5
+                torch.testing.assert_close(found[name][k].float(), value.float(), atol=limit, rtol=1e-4)
+
+
+def test_feet_stay_where_they_stand(store):
+    """All that is below the hips is similar: patches of feet are in the old places times the legs' factor, as the floor."""
+    data = windows(store.root, "mocap_every", OtherBodies(1.0))
+    plain, other = (each.batch(numbers(0, 4), numbers(1, 2)) for each in (windows(store.root, "mocap_every"), data))
+    bones, skeleton, feet = data.cut(numbers(0, 4), numbers(1, 2)).bones, store.load("r0").motion.skeleton, []
+    for batch, factors in ((plain, torch.ones_like(bones)), (other, bones)):
+        for k in range(2):
+            own = with_bones(skeleton, factors[k])
+            body = forward_kinematics(own, batch.R_parent_joint[k], batch.t_world_root[k], batch.t_parent_joint[k])
+            feet.append(site_positions(own, body, FOOT_PATCHES))
+    legs = bones[:, PARTS.index("legs")]
+    for k in range(2):
+        torch.testing.assert_close(feet[2 + k], legs[k] * feet[k], atol=1e-4, rtol=0)
+    floors = [windows(store.root, "hmd2", who).batch(numbers(0, 4), numbers(1, 2)) for who in (None, OtherBodies(1.0))]
+    assert floors[0].floor_from_head.abs().max() > 0.001
+    torch.testing.assert_close(floors[1].floor_from_head, legs[:, None] * floors[0].floor_from_head)
+
+
+@pytest.mark.parametrize("system", CONTENTS)
+def test_a_share_of_the_windows_is_of_others_and_the_rest_as_recorded(store, system):
+    chosen = numbers(0).repeat(60), torch.arange(60)
+    varied, plain = windows(store.root, system, OtherBodies(0.7)), windows(store.root, system).batch(*chosen)
+    others, batch = varied.cut(*chosen).others, varied.batch(*chosen)
+    assert torch.equal(batch.R_parent_joint, plain.R_parent_joint)
+    assert torch.equal((batch.size != plain.size).any(1), others)
+    for name, value in plain._asdict().items():
+        if value.is_floating_point():
+            torch.testing.assert_close(getattr(batch, name)[~others], value[~others], atol=1e-5, rtol=0)
+    many = varied.cut(numbers(0).repeat(4000), torch.arange(4000))
+    assert many.others.double().mean().item() == pytest.approx(0.7, abs=0.03)
+    people = [before.OtherBodies(1).proportions(seed) for seed in range(3000)]
+    older = torch.tensor([list(asdict(each).values()) for each in people])
+    logs = (many.bones[many.others, 1:].log(), older.log())
+    torch.testing.assert_close(*(each.T.cov() for each in logs), atol=2.5e-4, rtol=0)
+    assert logs[0].mean(0).abs().max() < 0.004
+    assert (many.bones[~many.others] == 1).all()
+    assert (many.bones[:, PARTS.index("device")] == 1).all()
 
 
 def test_validation_and_sources_that_say_so_are_as_recorded(store):
-    content, settings = CONTENTS["hmd2"]
-    for windows in (
-        Windows([Source(str(store.root))], "train", False, content=content, bodies=OtherBodies(3), **settings),
-        Windows(
-            [Source(str(store.root), bodies=False)], "train", True, content=content, bodies=OtherBodies(3), **settings
-        ),
-    ):
-        sizes = [windows[0, seed].size for seed in range(4)]
-        assert all(torch.equal(size, sizes[0]) for size in sizes)
+    for setting in ({"augmented": False}, {"free": False}):
+        size = windows(store.root, "hmd2", OtherBodies(1.0), **setting).batch(numbers(0, 0, 0), torch.arange(3)).size
+        assert torch.equal(size, size[:1].expand_as(size))
 
 
-def test_climbing_on_what_was_not_captured_is_not_trained_on(store, recording, tmp_path):
+def test_recordings_with_handled_objects_are_given_to_nobody_else(recording, tmp_path):
+    made = RecordingStore(tmp_path)
+    made.add(carrying(3.0, "handled", fps=60.0), split="train", config_hash="test")
+    made.add(replace(recording, name="walked"), split="train", config_hash="test")
+    data = windows(tmp_path, "hmd2", OtherBodies(1.0, arms=0.5))
+    cut = data.cut(torch.arange(len(data)), torch.arange(len(data)))
+    handled = data.packed.length[data.starts[:, 0]] == 180
+    assert torch.equal(cut.others, ~handled)
+    assert (cut.bones[handled] == 1).all()
+    assert torch.equal(cut.track[handled], data.starts[handled, 0])
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1, 1.1])
+def test_a_share_is_more_than_none(share):
+    with pytest.raises(WearcapError, match="a share of the windows, from 0 to 1"):
+        OtherBodies(share)
+
+
+def test_climbing_on_what_was_not_captured_is_not_trained_on(recording, tmp_path):
     """Without the floor, and with a provenance that says the ground is uneven, heights over it say nothing."""
     uneven = replace(recording.motion, provenance={**recording.motion.provenance, "floor": "uneven"})
+    made = RecordingStore(tmp_path)
     for name, motion in (("level", recording.motion), ("climbed", uneven)):
-        made = RecordingStore(tmp_path)
         made.add(replace(recording, name=name, motion=motion, floor=None), split="train", config_hash="test")
     for content, settings in CONTENTS.values():
-        windows = Windows([Source(str(tmp_path))], "train", content=content, **settings)
-        assert {windows.recordings[number][1] for number in windows.starts[:, 0].tolist()} == {"level"}
+        assert [content.usable(made, name) for name in ("level", "climbed")] == [True, False]
+        data = Windows([Source(str(tmp_path))], "train", content=content, **settings)
+        assert len(data.packed.length) == 1

@@ -4,12 +4,19 @@ import math
 from dataclasses import replace
 
 import pytest
+import scipy.stats
 import torch
 
+from benchmarks.rivals.single_windows import contact_windows
+from benchmarks.rivals.single_windows import transforms as before
 from contact_motion import CLASSES, bending, bending_dataset, bending_recording
+from drawn_windows import numbers, one
 from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import smpl24, smplh52
-from wearcap.data.transforms import Cut, DropFrames, Mirror, Shift, TimeStretch, mirrored_rotations
+from wearcap.data.batch import Batch
+from wearcap.data.draws import Draws
+from wearcap.data.packing import Packed, Track
+from wearcap.data.transforms import DropFrames, Mirror, Shift, TimeStretch, mirrored_rotations
 from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -35,8 +42,8 @@ def dataset(root, transforms=None, features=None, split="train", stride=40, stre
 def test_a_plain_window_is_the_recordings_own(root):
     windows = dataset(root)
     motion, interactions = bending(900, 0)
-    window = windows[(1, 5)]
-    assert torch.equal(window.R_parent_joint, motion.R_parent_joint[40:160])
+    window = one(windows, 1, 5)
+    torch.testing.assert_close(window.R_parent_joint, motion.R_parent_joint[40:160], atol=2e-4, rtol=0)
     for index, name in enumerate(CLASSES):
         assert torch.equal(window.contact[..., index], interactions.hand_contact(motion.timestamps[40:160], name))
     assert window.contact.any()
@@ -45,22 +52,22 @@ def test_a_plain_window_is_the_recordings_own(root):
 
 def test_content_is_a_function_of_the_seed(root):
     windows = dataset(root, ALL)
-    first, again, other = windows[(2, 7)], windows[(2, 7)], windows[(2, 8)]
+    first, again, other = (one(windows, 2, seed) for seed in (7, 7, 8))
     assert all(torch.equal(a, b) for a, b in zip(first, again))
     assert not torch.equal(first.R_parent_joint, other.R_parent_joint)
     assert first.error.norm(dim=-1).mean() < math.radians(5)
 
 
 def test_a_mirrored_window_swaps_hands_and_sides(root):
-    plain, turned = dataset(root), dataset(root, SHIFTED | {"mirror": Mirror()}, stride=1)
-    seen = [turned[(0, seed)] for seed in range(20)]
-    swapped = [window.contact.any(0)[0].any() != plain[(0, 0)].contact.any(0)[0].any() for window in seen]
-    assert 3 < sum(swapped) < 17
-    one = seen[swapped.index(True)]
-    torch.testing.assert_close(
-        mirrored_rotations(one.R_parent_joint, xsens23()), plain[(0, 0)].R_parent_joint, atol=1e-6, rtol=0
-    )
-    assert torch.equal(one.contact.flip(1), plain[(0, 0)].contact)
+    plain = one(dataset(root), 0)
+    turned = dataset(root, SHIFTED | {"mirror": Mirror()}, stride=1).batch(numbers(0).repeat(20), torch.arange(20))
+    held = turned.contact.any(1)[:, 0].any(-1)
+    swapped = held != plain.contact.any(0)[0].any()
+    assert 3 < swapped.sum() < 17
+    first = int(swapped.nonzero()[0])
+    mirrored = mirrored_rotations(turned.R_parent_joint[first], xsens23())
+    torch.testing.assert_close(mirrored, plain.R_parent_joint, atol=1e-6, rtol=0)
+    assert torch.equal(turned.contact[first].flip(1), plain.contact)
 
 
 def test_stretched_windows_keep_poses_and_truth_together(root):
@@ -68,7 +75,7 @@ def test_stretched_windows_keep_poses_and_truth_together(root):
     windows = dataset(root, {"shift": Shift(), "stretch": TimeStretch(1.2), "drop": DropFrames(0.3)})
     body = xsens23()
     for seed in range(6):
-        window = windows[(seed, seed)]
+        window = one(windows, seed, seed)
         elbows = window.R_parent_joint[:, body.indices("left_elbow", "right_elbow")]
         bent = rotation.log(elbows)[..., 2].abs()
         contact = window.contact.any(-1)
@@ -77,23 +84,32 @@ def test_stretched_windows_keep_poses_and_truth_together(root):
         torch.testing.assert_close(elbows @ elbows.mT, torch.eye(3).expand_as(elbows), atol=1e-5, rtol=0)
 
 
+def batch_of(R: torch.Tensor, count: int = 1, **changes) -> Batch:
+    packed, zeros = Packed([Track({"R_parent_joint": R}).packed()], ["one"]), torch.zeros(count, dtype=torch.long)
+    sensed = frozenset({"R_parent_joint"})
+    return Batch(packed, Draws(torch.arange(count)), zeros, zeros, len(R) - 1, 60.0, sensed=sensed, **changes)
+
+
 def test_lost_frames_are_bridged():
-    motion = bending(30)[0]
-    kept = torch.ones(30, dtype=torch.bool)
-    kept[[7, 8, 15]] = False
-    cut = Cut(0, 29, 30, speed=1.0, kept=kept)
-    R = cut.take("R_parent_joint", motion.R_parent_joint, sensed=True)
-    assert torch.equal(
-        R[kept[:29]], rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(motion.R_parent_joint[:29]))[kept[:29]]
-    )
-    assert rotation.geodesic(R, motion.R_parent_joint[:29]).max() < math.radians(3)
+    R, kept = bending(30)[0].R_parent_joint, torch.ones(1, 31, dtype=torch.bool)
+    kept[0, [7, 8, 15]] = False
+    whole, bridged = (batch_of(R, **more).read().values["R_parent_joint"][0] for more in ({}, {"kept": kept}))
+    assert torch.equal(bridged[kept[0, :29]], whole[kept[0, :29]])
+    assert not torch.equal(bridged[~kept[0, :29]], whole[~kept[0, :29]])
+    assert rotation.geodesic(bridged, R[:29]).max() < math.radians(3)
 
 
 def test_errors_have_the_size_that_was_asked_for():
-    random = torch.Generator().manual_seed(0)
-    sizes = [PoseNoise(5.0).errors(300, 23, random).square().sum(-1).mean().sqrt() for _ in range(200)]
-    assert max(sizes) < math.radians(5.6)
-    assert sum(sizes) / len(sizes) == pytest.approx(math.radians(2.5), rel=0.15)
+    batch = PoseNoise(5.0)(batch_of(torch.eye(3).repeat(301, 23, 1, 1), 200).read())
+    sizes = batch.values["error"].square().sum(-1).mean((1, 2)).sqrt()
+    assert sizes.max() < math.radians(5.6)
+    assert sizes.mean().item() == pytest.approx(math.radians(2.5), rel=0.15)
+    random = before.Draws(0)
+    window = before.Window({"R_parent_joint": torch.eye(3).repeat(300, 23, 1, 1)})
+    older = torch.stack([contact_windows.PoseNoise(5.0)(window, random).values["error"] for _ in range(200)])
+    slow = [each.diff(dim=1).square().sum(-1).mean((1, 2)).sqrt() for each in (batch.values["error"], older)]
+    assert scipy.stats.ks_2samp(*slow).pvalue > 0.01
+    assert scipy.stats.ks_2samp(sizes, older.square().sum(-1).mean((1, 2)).sqrt()).pvalue > 0.01
 
 
 def test_another_skeleton_and_rate_are_converted(tmp_path):
@@ -107,7 +123,7 @@ def test_another_skeleton_and_rate_are_converted(tmp_path):
         t_world_root=recording.suit.t_world_root[::2],
     )
     store.add(replace(recording, suit=half), split="train", config_hash="test")
-    window = dataset(tmp_path, features=SmplAngles())[(0, 0)]
+    window = one(dataset(tmp_path, features=SmplAngles()), 0)
     expected = in_skeleton(xsens23(), retarget_skeleton(xsens23(), smpl24()), recording.suit.R_parent_joint[:120])
     assert rotation.geodesic(window.R_parent_joint, expected).max() < math.radians(2)
 
@@ -117,10 +133,10 @@ def test_recordings_without_truth_or_suit_are_named(tmp_path):
     store.add(replace(bending_recording(400, "a"), interactions=None), split="train", config_hash="test")
     store.add(replace(bending_recording(400, "b"), suit=None), split="val", config_hash="test")
     with pytest.raises(WearcapError, match="a.safetensors: this recording has no interactions"):
-        dataset(tmp_path)[(0, 0)]
+        dataset(tmp_path)
     with pytest.raises(WearcapError, match="no suit"):
-        dataset(tmp_path, split="val")[(0, 0)]
-    with pytest.raises(WearcapError, match='expected.*"suit" or "motion"|"suit" or "motion"'):
+        dataset(tmp_path, split="val")
+    with pytest.raises(WearcapError, match='"suit" or "motion"'):
         dataset(tmp_path, stream="watch")
 
 

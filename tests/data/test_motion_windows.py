@@ -7,10 +7,12 @@ from functools import partial
 import pytest
 import torch
 
+from benchmarks.rivals.single_windows.transforms import Window, mirrored
+from drawn_windows import numbers, one
 from wearcap.body.skeleton import xsens23
 from wearcap.data.datamodule import Loading, WindowsModule
 from wearcap.data.motion_features import MotionFeatures, Movement, MovementContent
-from wearcap.data.transforms import Mirror, Shift, Window, joint_twins, mirrored
+from wearcap.data.transforms import Mirror, Shift, joint_twins
 from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -92,22 +94,25 @@ def test_a_mirror_swaps_left_and_right():
 def test_windows_of_a_data_set_are_its_true_motion(tmp_path):
     store = small_dataset(tmp_path)
     varied = {"shift": Shift(), "mirror": Mirror()}
-    settings = {"content": MovementContent(FEATURES), "window": 60, "stride": 30, "fps": 60.0, "transforms": varied}
+    settings = {"content": MovementContent(FEATURES), "window": 20, "stride": 10, "fps": 20.0, "every": 3}
     plain = Windows([Source(str(tmp_path))], "train", **settings)
     for index in (0, 5, len(plain) - 1):
-        recording, start, _ = plain.starts[index].tolist()
-        motion = store.load(plain.recordings[recording][1]).motion
-        truth = motion.sliced(start, start + 60)
-        torch.testing.assert_close(plain[index].joints, truth.T_world_joint.t[::3], atol=1e-5, rtol=0)
-        assert torch.equal(plain[index].R_world_root, truth.R_parent_joint[::3, 0])
-    data = WindowsModule(partial(Windows, **settings), Loading(4, 2), {"a": {"root": str(tmp_path)}})
+        track, start = plain.starts[index].tolist()
+        motion = store.load(store.names("train")[track]).motion
+        truth, window = motion.sliced(3 * start, 3 * start + 60), one(plain, index)
+        torch.testing.assert_close(window.joints, truth.T_world_joint.t[::3], atol=1e-5, rtol=0)
+        torch.testing.assert_close(window.R_world_root, truth.R_parent_joint[::3, 0], atol=2e-4, rtol=0)
+        torch.testing.assert_close(window.floor_height, FEATURES.movement(motion).floor_height[start : start + 20])
+    data = WindowsModule(partial(Windows, transforms=varied, **settings), Loading(4, 2), {"a": {"root": str(tmp_path)}})
     data.setup("fit")
     batches = list(data.train_dataloader())
     assert [len(batch.joints) for batch in batches] == [4, 4]
-    again = list(data.train_dataloader())
-    assert torch.equal(batches[1].joints, again[1].joints)
-    assert not torch.equal(data.train[(0, 1)].joints, data.train[(0, 2)].joints)  # shifted, mirrored
+    assert torch.equal(batches[1].joints, list(data.train_dataloader())[1].joints)
+    joints = data.train.batch(numbers(0, 0), numbers(1, 2)).joints
+    assert not torch.equal(joints[0], joints[1])  # shifted, mirrored
     assert len(next(iter(data.val_dataloader())).joints) == 4
+    with pytest.raises(WearcapError, match=r"windows of every 1th frame.*every 3th"):
+        Windows([Source(str(tmp_path))], "train", **settings | {"every": 1, "fps": 60.0})
 
 
 def test_what_it_cannot_describe_is_refused():

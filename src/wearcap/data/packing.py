@@ -4,6 +4,7 @@ Rotations are quaternions of 16-bit numbers (off by less than 0.004 degrees). Wh
 of the data set's cache, so that the next training starts at once.
 """
 
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -20,7 +21,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 
 KEPT = 4
-"""Number of different packings of a data set, the newest ones, whose files are kept."""
+"""Number of different packings of a data set, those that were used last, whose files are kept."""
 _STEP = float(torch.iinfo(torch.int16).max)
 
 
@@ -138,8 +139,10 @@ def kept_track(root: Path, key: str, name: str, make: Callable[[], Track]) -> Tr
     return track
 
 
-def forget_old(root: Path) -> None:
-    """Remove the files of all but the newest `KEPT` packings of a data set."""
+def forget_old(root: Path, key: str) -> None:
+    """Remove the files of all but `KEPT` packings of a data set: the one of a key, and those that were used last."""
+    with suppress(OSError):  # a data set that is only read
+        os.utime(root / "cache" / f"windows-{key}")
     folders = sorted((root / "cache").glob("windows-*"), key=lambda folder: folder.stat().st_mtime, reverse=True)
     for folder in folders[KEPT:]:
         shutil.rmtree(folder, ignore_errors=True)

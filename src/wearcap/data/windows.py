@@ -160,7 +160,7 @@ class Windows:
         kept = _Kept(self.content, [each for each, free in zip(found, varied) if free])
         tracks = [kept(*each) for each in progress(made, "packing recordings", transient=True, disable=len(made) < 8)]
         for root in {each.store.root for each in found}:
-            forget_old(root)
+            forget_old(root, kept.key)
         if self.bodies is None:
             tracks = [_of_wearer(track, self.content.parts) for track in tracks]
         self.packed = Packed(tracks, [each.name for each, _ in made])

@@ -1,0 +1,115 @@
+"""Packed recordings: how exactly rotations are kept, what is refused, and the cache of a data set."""
+
+import os
+from dataclasses import replace
+
+import pytest
+import torch
+
+from drawn_windows import numbers
+from wearcap.data.packing import KEPT, Packed, Track, kept_track, quantized, require_rows
+from wearcap.data.transforms import Shift
+from wearcap.data.windows import Source, Windows
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.systems.mocap_every.training_windows import WatchContent
+from wearcap_testing import small_dataset
+
+
+def test_rotations_are_kept_within_a_hundredth_of_a_degree():
+    R = rotation.exp(4 * torch.randn(4000, 3, generator=torch.Generator().manual_seed(1))).double()
+    kept = quantized(R[:, None].float())
+    assert (kept.dtype, kept.shape) == (torch.int16, (4000, 4, 1))
+    back = rotation.matrix_from_quat_wxyz(kept[..., 0].double())
+    off = rotation.log(R.mT @ back).norm(dim=-1).rad2deg()
+    assert off.max() < 0.01
+
+
+def test_recordings_lie_one_after_another():
+    parts = [torch.arange(3.0), torch.arange(5.0) + 10]
+    packed = Packed([Track({"floor": part}, {"size": part[:2]}) for part in parts], ["a", "b"])
+    assert packed.values["floor"].tolist() == [0, 1, 2, 10, 11, 12, 13, 14]
+    assert (packed.first.tolist(), packed.length.tolist()) == ([0, 3], [3, 5])
+    assert packed.constants["size"].tolist() == [[0, 1], [10, 11]]
+    assert packed.bytes == 4 * (8 + 4)
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (Track({"t": torch.zeros(4, 24, 3)}, {"size": torch.zeros(5)}), r"b: values of shapes.*\(24, 3\).*\(23, 3\)"),
+        (Track({"t": torch.zeros(4, 23, 3)}, {"size": torch.zeros(6)}), r"b: constants of shapes.*\(6,\)"),
+        (Track({"t": torch.zeros(4, 23, 3), "vel": torch.zeros(4)}, {"size": torch.zeros(5)}), "values of.*vel"),
+        (Track({"t": torch.zeros(4, 23, 3)}, {"size": torch.zeros(5)}, {"x": torch.zeros(1)}), "tables of.*x"),
+    ],
+)
+def test_recordings_of_other_shapes_are_refused(other, message):
+    first = Track({"t": torch.zeros(9, 23, 3)}, {"size": torch.zeros(5)})
+    with pytest.raises(WearcapError, match=message):
+        Packed([first, other], ["a", "b"])
+    with pytest.raises(WearcapError, match="different lengths.*'b': 4"):
+        require_rows({"a": first.values["t"], "b": other.values["t"]}, "file")
+
+
+def test_a_track_is_the_same_from_its_file(tmp_path):
+    R = rotation.exp(torch.randn(6, 3))
+    track = Track({"R_world_head": R, "object": torch.arange(6).int()}, {"size": R[0]}, {"object": R})
+    made = [kept_track(tmp_path, "key", "a", lambda: track) for _ in range(2)]
+    assert made[0].flat().keys() == made[1].flat().keys()
+    assert all(torch.equal(value, made[1].flat()[name]) for name, value in made[0].flat().items())
+
+
+def windows(root, content=None, **changes) -> Windows:
+    settings = {"window": 40, "stride": 10, "fps": 30.0, "every": 2, "transforms": {"shift": Shift()}} | changes
+    return Windows([Source(str(root))], "train", True, content=content or WatchContent(), **settings)
+
+
+def alike(one: Windows, two: Windows) -> bool:
+    chosen, seeds = numbers(0, 3, 9), numbers(4, 5, 6)
+    return all(torch.equal(*parts) for parts in zip(one.batch(chosen, seeds), two.batch(chosen, seeds)))
+
+
+def test_a_second_training_reads_files_and_makes_damaged_ones_anew(tmp_path, monkeypatch):
+    store = small_dataset(tmp_path)
+    first = windows(tmp_path)
+    files = sorted((tmp_path / "cache").rglob("windows-*/*.safetensors"))
+    assert len(files) == len(store.names("train"))
+    whole = files[1].read_bytes()
+    files[1].write_bytes(whole[: len(whole) // 2])
+    makes, make = [], WatchContent.track
+    monkeypatch.setattr(WatchContent, "track", lambda self, *args: makes.append(args[1]) or make(self, *args))
+    assert alike(windows(tmp_path), first)
+    assert len(makes) == 1
+    assert files[1].read_bytes() == whole
+    assert alike(windows(tmp_path), first)
+    assert len(makes) == 1
+    # Other settings of the content, and recordings that changed, are other files.
+    monkeypatch.setattr(WatchContent, "settings", lambda self: "other")
+    windows(tmp_path)
+    assert len(makes) == 1 + len(files)
+    store.add(replace(store.load("r1"), name="r0"), split="train", config_hash="test")
+    windows(tmp_path)
+    assert len(makes) == 2 + len(files)
+
+
+def test_a_data_set_that_is_only_read_still_trains(tmp_path):
+    for name in ("written", "read"):
+        small_dataset(tmp_path / name)
+    (tmp_path / "read" / "cache").touch()  # no folder can be made here, whoever runs the tests
+    assert alike(windows(tmp_path / "read"), windows(tmp_path / "written"))
+    assert (tmp_path / "read" / "cache").is_file()
+
+
+def test_the_packings_that_were_used_last_are_kept(tmp_path):
+    """Those of another training's start, and one's own, though it was made before all others."""
+    small_dataset(tmp_path)
+    windows(tmp_path)
+    (own,) = (tmp_path / "cache").glob("windows-*")
+    for age, folder in enumerate([*(own.with_name(f"windows-old{number}") for number in range(KEPT + 2)), own]):
+        folder.mkdir(exist_ok=True)
+        os.utime(folder, (1e9 - age, 1e9 - age))
+    (tmp_path / "cache" / "other").mkdir()
+    windows(tmp_path)
+    old = {f"windows-old{age}" for age in range(KEPT - 1)}
+    assert {folder.name for folder in (tmp_path / "cache").iterdir()} == old | {"other", own.name}
+    assert len(list(own.iterdir())) == 3
