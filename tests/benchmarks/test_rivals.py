@@ -43,7 +43,18 @@ def datasets(tmp_path_factory) -> Path:
 
 def given(datasets: Path, runs: Path, *more: str) -> list[str]:
     overrides = [f"paths.datasets={datasets}", "trainer.precision=32-true", *SMALL, *QUIET]
-    return ["hmd2", "--only", NAME, "--runs", str(runs), "--budget", str(STEPS * STEP), *more, "--overrides", *overrides]
+    return [
+        "hmd2",
+        "--only",
+        NAME,
+        "--runs",
+        str(runs),
+        "--budget",
+        str(STEPS * STEP),
+        *more,
+        "--overrides",
+        *overrides,
+    ]
 
 
 def finish(arguments: list[str]) -> object:

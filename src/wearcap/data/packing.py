@@ -63,9 +63,15 @@ class Track:
         return cls(**parts)
 
     def packed(self) -> "Track":
-        """With rotations as they are kept."""
-        values = {name: quantized(value) if is_rotation(name) else value for name, value in self.values.items()}
-        return Track({name: value.contiguous() for name, value in values.items()}, self.constants, self.tables)
+        """With rotations as they are kept, and numbers of single precision."""
+        values = {
+            name: quantized(value) if is_rotation(name) else _single(value) for name, value in self.values.items()
+        }
+        return Track(values, {name: _single(value) for name, value in self.constants.items()}, self.tables)
+
+
+def _single(value: Tensor) -> Tensor:
+    return (value.float() if value.dtype == torch.float64 else value).contiguous()
 
 
 class Packed:
@@ -101,18 +107,27 @@ class Packed:
 
 
 def _require_alike(track: Track, first: Track, name: str) -> None:
+    """Compiled loops read tracks without looking: all rows are there, of the same kind as those of the first recording."""
+    lengths = {len(value) for value in track.values.values()}
+    rotations = [value for key, value in track.values.items() if is_rotation(key)]
+    rows = all(
+        int(track.values[key].min()) >= -1 and int(track.values[key].max()) < len(track.tables[key])
+        for key in track.tables
+    )
+    if len(lengths) > 1 or not rows or any(R.dtype != torch.int16 or R.shape[1:-1] != (4,) for R in rotations):
+        fix = "Delete the data set's cache/windows-… folders: they are made again."
+        raise WearcapError("a packed recording whose rows do not belong together", where=name, fix=fix)
     for part in fields(Track):
-        found, expected = (
-            {
-                key: tuple(value.shape[0 if part.name == "constants" else 1 :])
-                for key, value in getattr(each, part.name).items()
-            }
-            for each in (track, first)
-        )
+        found, expected = (_kinds(getattr(each, part.name), part.name) for each in (track, first))
         if found != expected:
-            what = f"{part.name} of shapes {found}"
+            what = f"{part.name} of other kinds: {found}"
             fix = "Train on data sets of one skeleton."
             raise WearcapError(what, where=name, expected=f"those of the first recording, {expected}", fix=fix)
+
+
+def _kinds(values: dict[str, Tensor], part: str) -> dict[str, tuple]:
+    """Type and size of values, or of their rows."""
+    return {key: (value.dtype, *value.shape[0 if part == "constants" else 1 :]) for key, value in values.items()}
 
 
 def _joined(parts: list[Tensor], spare: int = 0) -> Tensor:
