@@ -168,7 +168,7 @@ def test_an_unknown_modality_is_refused(truth):
 
 
 def test_a_data_set_brings_its_objects(dataset):
-    store = dataset.recordings[0][0]
+    store = dataset.recordings[0].store
     echo = drawn_echo()
     sources = [CaptureInput(store.load(name), store.root) for name in ("c0", "c1")]
     motions = [captured.motion for captured in echo.capture(sources, [0, 0])]
@@ -182,7 +182,7 @@ def test_a_data_set_brings_its_objects(dataset):
 
 def test_the_nearest_window_of_what_was_seen_is_itself(dataset):
     nearest = baselines.NearestEcho.fit(dataset, window=12, stride=1)
-    recording = replace(dataset.recordings[0][0].load("c0"), name="again")
+    recording = replace(dataset.recordings[0].store.load("c0"), name="again")
     motion = nearest.capture_scenarios([scenario_of(recording, margin_s=2.0)], [0])[0]
     away = (motion.T_world_joint.t - recording.motion.T_world_joint.t).norm(dim=-1)
     assert away.mean() < 0.03
@@ -209,7 +209,7 @@ def test_baselines_are_functions_of_the_training_split_alone(dataset):
     assert torch.equal(one.outputs, two.outputs)
     assert set(one.descriptor) == {"box"}
     np.testing.assert_array_equal(one.frames["box"].numpy(), two.frames["box"].numpy())
-    assert RecordingStore.open(dataset.recordings[0][0].root).names("train") == ["c0"]
+    assert RecordingStore.open(dataset.recordings[0].store.root).names("train") == ["c0"]
     assert len(boxes()) == 1
 
 
