@@ -26,6 +26,7 @@ from benchmarks.rivals.window_loaders import Archive, ClipsInMemory, FilePerItem
 from benchmarks.speed.figures import figure
 from benchmarks.speed.training_paths import EXPERIMENTS, config_of, data_now, has_data, samples, small_sets, threads
 from wearcap.recording import RecordingStore
+from wearcap.training.run import keep_freed_memory
 
 GOAL = 20.0
 UNIT = "windows/s and core"
@@ -43,6 +44,7 @@ def measure(
 ) -> list[dict]:
     """Of the data sets of a folder, as far as they are there; None: of a small generated one."""
     figures = []
+    keep_freed_memory()  # as trainings do
     with TemporaryDirectory() as folder, threads(1):
         given = () if datasets else small_sets(Path(folder))
         for experiment in experiments:
