@@ -102,11 +102,12 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
             self._measure = torch.compile(self.measure, dynamic=False, mode=mode)
 
     def _is_compiled(self) -> bool:
-        """Whether training steps are compiled. "auto": on a GPU, and on a CPU for runs of `WORTH_COMPILING` steps of networks
-        without dropout, whose random numbers cost compiled code more than it saves."""
+        """Whether training steps are compiled. "auto": on a GPU, and on a CPU with vector instructions for runs of
+        `WORTH_COMPILING` steps of networks without dropout, whose random numbers cost compiled code more than it saves."""
         require_choice(str(self.compiles).lower(), ("true", "false", "auto"), f"model.compile={self.compiles!r}")
         dropout = any(isinstance(part, torch.nn.Dropout) and part.p > 0 for part in self.modules())
-        pays = self.device.type == "cuda" or (self.trainer.max_steps >= WORTH_COMPILING and not dropout)
+        vectors = torch.backends.cpu.get_cpu_capability() != "DEFAULT"  # PyTorch compiles for no other CPU
+        pays = self.device.type == "cuda" or (self.trainer.max_steps >= WORTH_COMPILING and not dropout and vectors)
         if not (pays if self.compiles == "auto" else self.compiles):
             return False
         found = any(shutil.which(name) for name in (os.environ.get("CXX", "g++"), "clang++"))
