@@ -162,7 +162,7 @@ def test_two_processes_agree_with_one(tmp_path):
         script.write_text(HALVES.format(folder=os.path.dirname(__file__), processes=processes, path=path))
         done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False, timeout=120)
         assert done.returncode == 0, done.stderr[-2000:]
-        states.append(torch.load(path))
+        states.append(torch.load(path, weights_only=True))
     for name, value in states[0].items():
         torch.testing.assert_close(value, states[1][name], msg=name)
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from benchmarks.rivals.single_windows.arm_mixing import ArmDonors
 from wearcap.body.skeleton import Skeleton
+from wearcap.data.arm_mixing import ArmDonors
 from wearcap.errors import WearcapError
 from wearcap.recording.recording import FloorTrack, HeadStream, Recording
 from wearcap.recording.store import RecordingFile

@@ -15,9 +15,9 @@ from jaxtyping import Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from benchmarks.rivals.single_windows.arm_mixing import ArmDonors
 from benchmarks.rivals.single_windows.bodies import OtherBodies, OtherPerson
 from benchmarks.rivals.single_windows.transforms import Cut, Draws, TimeStretch, TimeTransform, Transform, Window
+from wearcap.data.arm_mixing import ArmDonors
 from wearcap.errors import WearcapError
 from wearcap.recording.store import RecordingFile, RecordingStore
 
