@@ -1,7 +1,8 @@
 """Trainings with windows drawn in batches against the same trainings with windows drawn one by one, to equal validation.
 
 Both begin with the same weights and statistics, train for the same number of steps with their schedule, and are validated
-on the same windows. Before: one by one, in the training's own process, with `BEFORE`'s settings. `…_EXPERIMENT`: seconds of
+on the same windows. Nobody else does a wearer's motion (`data.dataset.bodies`): one by one, opening recordings for each
+person takes longer than the training. Before: one by one, in the training's own process, with `BEFORE`'s settings. `…_EXPERIMENT`: seconds of
 training, without validations, until the validation loss that the training before has at its end; ratio = baseline / value,
 to be at least `goal`, and no more than a bound where the unit names it. `…_step`, `…_drawing`, `…_together`: milliseconds of
 a step on a batch that is there, of drawing one, of a step of the training. `…_opening`: seconds until the data set is there,
@@ -57,7 +58,8 @@ def measure(
             small_sets(Path(folder)) if datasets is None else (f"data.loading.steps_per_epoch={max(1, steps // 12)}",)
         )
         for experiment in experiments:
-            config = config_of(experiment, Path(datasets or folder), *given, f"trainer.max_steps={steps}")
+            more = f"trainer.max_steps={steps}", "++data.dataset.bodies=null"
+            config = config_of(experiment, Path(datasets or folder), *given, *more)
             if has_data(config):
                 figures += compared(experiment, config, fixed)
     return figures

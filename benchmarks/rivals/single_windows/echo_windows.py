@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from benchmarks.rivals.single_windows.bodies import OtherPerson
@@ -16,7 +15,6 @@ from wearcap.body.contact_points import TOUCH_M, contact_points
 from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
 from wearcap.data.features import body_size, on_level_ground
 from wearcap.diffusion.levels import DRAWS
-from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.environment import read_environment
 from wearcap.models.checkpoint import load_network
@@ -38,14 +36,12 @@ from wearcap.systems.echo.features import (
 )
 from wearcap.systems.echo.observations import ObjectReader, ObjectShape
 from wearcap.systems.echo.scores import body_contact, foot_patches
-from wearcap.systems.echo.training_windows import EchoWindow
+from wearcap.systems.echo.training_windows import EchoWindow, canonical
 
 MIN_FRAMES = 6
 """Length of the shortest training window (frames)."""
 CANONICAL = "canonical", "canonical_mirrored"
 """Names of the objects' canonical poses, for windows as they are and for mirrored ones."""
-ASKEW_DEG = 22.5
-"""Angle between the wearer's heading and the orientation to which the canonical ones are nearest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,38 +115,6 @@ class EchoTrack:
         wearer = floor.float(), motion.skeleton, body_size(motion.skeleton)
         truth = Body(motion.R_parent_joint[take], motion.t_world_root[take])
         return cls(points, *wearer, truth, contact, objects, active, Rigid(R, t), (alike[0], alike[1]))
-
-
-def canonical(
-    T_world_object: Rigid,
-    objects: list[ObjectShape],
-    R_world_head: Float[Tensor, "time 3 3"],
-    touched: Bool[Tensor, "time"],
-    active: Int64[Tensor, "time"],
-    side: float = 1.0,
-) -> Rigid:
-    """Poses of the active object's centre that look the same and that a network can know: of all orientations that are alike
-    by the object's symmetry, the one nearest to the wearer's heading when the object is first touched, for as long as it is
-    active.
-
-    The heading is turned by `ASKEW_DEG` to the left (`side` 1) or right (-1, for mirrored windows), as objects are often
-    held along or across it, and the choice must not lie on an edge.
-    """
-    R, t = T_world_object.R.clone(), T_world_object.t.clone()
-    askew = torch.tensor(side * ASKEW_DEG).deg2rad()
-    begins = [0, *(active.diff().nonzero()[:, 0] + 1).tolist(), len(active)]
-    for start, stop in pairwise(begins):
-        if active[start] == NO_OBJECT:
-            continue
-        shape = objects[int(active[start])]
-        first = start + int(touched[start:stop].float().argmax())
-        heading = rotation.about_axis("z", rotation.yaw_of(R_world_head[first]) + askew)
-        before = shape.of_mesh(T_world_object[first])
-        # The turn in the mesh's axes that this moment asks for is the whole span's.
-        turn = before.to(torch.float64).inverse() @ shape.symmetry.nearest(before, heading)
-        pose = shape.centred(shape.of_mesh(T_world_object[start:stop]).to(torch.float64) @ turn)
-        R[start:stop], t[start:stop] = pose.R.to(R), pose.t.to(t)
-    return Rigid(R, t)
 
 
 class EchoContent(Content):
