@@ -57,6 +57,34 @@ def test_a_head_alone_does_not_see_the_hands(walked, frame):
         small_features(frame, points=["left_wrist"])
 
 
+@pytest.mark.parametrize("frame", FRAMES)
+def test_wrists_that_are_missing_are_zeros_and_flagged(walked, frame):
+    """Everything of the others stays; a rate needs the frame before, too."""
+    points, *_, floor = walked
+    plain, features = (
+        small_features(frame, points=["head", "left_wrist", "right_wrist"]),
+        small_features(frame, gaps=True),
+    )
+    seen = torch.ones(1, floor.shape[1], 3, dtype=torch.bool)
+    whole = plain.condition(points, floor, SIZE)
+    condition = features.condition(points._replace(seen=seen), floor, SIZE)
+    assert condition.shape[-1] == features.condition_size == plain.condition_size + 2
+    assert torch.equal(condition, torch.cat([whole, torch.ones(1, floor.shape[1], 2)], -1))
+    assert torch.equal(features.condition(points, floor, SIZE), condition), "none is missing where nobody says"
+    seen[0, 10:14, 2] = False
+    lost = points.t_world_point.clone()
+    lost[0, 10:14, 2] = 77.0
+    condition = features.condition(points._replace(t_world_point=lost, seen=seen), floor, SIZE)
+    right = {"R": slice(12, 18), "turn": slice(30, 36), "place": slice(42, 45), "velocity": slice(51, 54)}
+    for name, columns in right.items():
+        missing = (condition[0, :, columns] == 0).all(-1)
+        last = 15 if name in ("turn", "velocity") else 14
+        assert missing.nonzero()[:, 0].tolist() == [*range(10, last)], name
+    assert torch.equal(condition[0, :, -2:], seen[0, :, 1:].float())
+    others = [k for k in range(whole.shape[-1]) if not any(k in range(c.start, c.stop) for c in right.values())]
+    assert torch.equal(condition[..., others], whole[..., others])
+
+
 @pytest.mark.parametrize("body", [True, False])
 @pytest.mark.parametrize(("frame", "size"), [("window", 54), ("world", 54), ("own", 56)])
 def test_sizes_are_the_papers(walked, frame, size, body):
@@ -100,7 +128,7 @@ def test_the_condition_is_eq_4(walked, frame):
     points, *_, floor = walked
     features = small_features(frame, body=False)
     condition = features.condition(points, floor, SIZE)[0]
-    at, (R, t) = features.canonical(points), points
+    at, (R, t, _) = features.canonical(points), points
     for k in (1, 17):
         own = at.R[0, min(k, at.R.shape[1] - 1)].mT
         origin = at.t[0, min(k, at.t.shape[1] - 1)]

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
-from carried_box import FPS, GRIP, WINDOW, boxes, carrying, drawn_echo, scenario_of, with_settings
+from carried_box import FPS, GRIP, WINDOW, boxes, carrying, drawn_echo, scenario_of, small_features, with_settings
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.diffusion.process import add_noise
 from wearcap.errors import WearcapError
@@ -23,6 +23,7 @@ from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import Conditioning, EchoQueue
 from wearcap.systems.echo.windows import AveragedWindows, Rewindow
 from wearcap.tracking.head_path import head_path
+from wearcap.tracking.wrists import UNSEEN_S
 
 TWO = (("box_1", "left", 0.1, 0.35), ("box_2", "right", 0.6, 0.8))
 FRAMES = ("own", "window", "world")
@@ -502,6 +503,23 @@ def test_wrists_of_controllers_are_as_good_as_true_ones():
     )
     torch.testing.assert_close(one.t_world_point, two.t_world_point, atol=1e-4, rtol=0)
     torch.testing.assert_close(one.R_world_point, two.R_world_point, atol=1e-4, rtol=0)
+
+
+def test_a_network_that_knows_gaps_takes_wrists_that_come_and_go():
+    recording, features = carrying(1.0), small_features(gaps=True)
+    known, late = tracked(recording), {}
+    for joint, kept in (("left_wrist", slice(45, None)), ("right_wrist", slice(0, 30))):
+        late[joint] = known.tracked[joint][kept]
+    for tracks in (late, {"left_wrist": late["left_wrist"]}):
+        given = replace(recording, tracked=tracks, motion=None)
+        seen = batch_item(drawn_echo(features=features), scenario_of(given)).conditioning.seen[0]
+        assert seen[:, 0].all()
+        assert seen[:, 1].nonzero()[:, 0].tolist() == [*range(15, len(seen))]
+        assert seen[:, 2].sum() == (1 + int(30 * (29 / 90 + UNSEEN_S)) if len(tracks) == 2 else 0)
+        motion = drawn_echo(features=features)(given)
+        assert motion.T_world_joint.t.isfinite().all()
+    with pytest.raises(WearcapError, match="only left_wrist is tracked"):
+        drawn_echo()(given)
 
 
 def test_observations_may_be_in_double_precision():

@@ -49,6 +49,7 @@ def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Conditioning, Out
         zeros,
         contact,
         observed_parts,
+        torch.ones(1, count, 3, dtype=torch.bool),
     )
     path = torch.arange(count, dtype=torch.float32)
     turn = rotation.exp(torch.stack([0 * path, 0 * path, 0.1 * path], -1))

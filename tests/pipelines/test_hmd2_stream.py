@@ -12,10 +12,12 @@ from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.layers import TransformerSize
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import CameraStream, Motion, PointCloud, Recording
 from wearcap.runtime.wearer import Wearer
+from wearcap.sensors.samples import WristSample
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
@@ -38,7 +40,7 @@ def places() -> VoxelAutoencoder:
 def pipeline(places):
     """Makes small pipelines with random weights that do say something."""
 
-    def make(stride: int = STRIDE, points: bool = True, seed: int = 0, **changes) -> HMD2:
+    def make(stride: int = STRIDE, points: bool = True, seed: int = 0, hands: bool = False, **changes) -> HMD2:
         torch.manual_seed(seed)
         features = HeadFeatures(contacts=True, body=True)
         net = MotionDenoiser(
@@ -48,7 +50,7 @@ def pipeline(places):
             TransformerSize(32, 1, 4, 64, 0.0),
             4,
             blend=5,
-            conditions={"points": places.size, "image": IMAGE} if points else {},
+            conditions=({"points": places.size, "image": IMAGE} if points else {}) | ({"hands": 20} if hands else {}),
         )
         for parameter in net.parameters():
             torch.nn.init.normal_(parameter, std=0.05)
@@ -148,6 +150,36 @@ def test_streaming_equals_the_capture_of_the_whole(pipeline, stride, frames, win
     streamed = stream(HMD2Session(hmd2, [wearer(recording)], [3]), moments(recording))[0]
     assert len(streamed) == frames
     assert_same(streamed, hmd2(recording, seed=3))
+
+
+def test_hands_that_come_and_go_are_streamed_as_the_capture_of_the_whole_has_them(pipeline):
+    """They are tracked with the head, so that a stream's newest pose is at the frame's time."""
+    recording, hmd2 = surrounded(90), pipeline(points=False, hands=True)
+    seen = {"left_wrist": [*range(20, 40), *range(60, 70)], "right_wrist": [*range(90)]}
+    tracked = {}
+    for joint, rows in seen.items():
+        T = recording.motion.joint(joint)[rows]
+        tracked[joint] = Trajectory(recording.head.timestamps[rows], T.R, T.t)
+    given = replace(recording, tracked=tracked)
+    whole = hmd2(given, seed=3)
+    for part in (slice(25, 35), slice(62, 68)):
+        other = replace(given, tracked={"right_wrist": tracked["right_wrist"]})
+        assert (whole.R_parent_joint - hmd2(other, seed=3).R_parent_joint)[part].abs().max() > 1e-3
+    samples = []
+    for sample in moments(recording):
+        here = ((joint, (track.timestamps - sample.timestamp).abs().argmin()) for joint, track in tracked.items())
+        samples += [
+            WristSample(joint, sample.timestamp, tracked[joint].T_world_body[row])
+            for joint, row in here
+            if tracked[joint].timestamps[row] == sample.timestamp
+        ]
+        samples.append(sample)
+    session = HMD2Session(hmd2, [wearer(recording)], [3])
+    assert_same(stream(session, samples)[0], whole)
+    assert not session.refused[0]
+    wrong = WristSample("left_wrist", 1.0, Rigid(2 * torch.eye(3), torch.zeros(3)))
+    session.push([[wrong, WristSample("elbow", 1.0, wrong.T_world_joint)]])
+    assert session.refused[0] == {"left_wrist: not a rotation": 1, "head: wrong type or shape": 1}
 
 
 def test_shorter_windows_stream_as_the_capture_of_the_whole_has_them(pipeline):

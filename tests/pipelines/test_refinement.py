@@ -15,7 +15,7 @@ from wearcap.metrics.physics import foot_contact, foot_points, foot_skate_cm_s, 
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.tracking.foot_lock import FootLock
-from wearcap.tracking.refinement import Measured, Refinement, Refiner, with_limbs_bent
+from wearcap.tracking.refinement import FADE_S, Measured, Refinement, Refiner, with_limbs_bent
 
 FPS = 30.0
 FEET = FootLock(
@@ -191,6 +191,29 @@ def test_one_frame_is_enough():
     motion, _ = truth()
     one = motion.sliced(0, 1)
     assert refined(Refinement(1.0, FEET, False), one).R_parent_joint.isfinite().all()
+
+
+@pytest.mark.parametrize("piece", [4, 200])
+def test_arms_go_over_to_wrists_that_come_into_view_and_leave_those_that_were_lost(piece):
+    motion, _ = truth()
+    wrists = motion.T_world_joint[:, motion.skeleton.indices(*WRISTS)]
+    goal = Rigid(wrists.R, wrists.t + torch.tensor([0.0, 0.0, 0.05]))
+    seen, fade = torch.ones(len(motion), 2, dtype=torch.bool), round(FADE_S * FPS)
+    seen[:40, 0], seen[90:, 0] = False, False
+    goal.t[~seen] = 1e3  # never looked at
+    known, refiner, parts = Measured.of(motion.joint("head"), torch.zeros(len(motion)), goal, seen), None, []
+    refiner = Refiner(Refinement(0.0, None, True), motion.skeleton, FPS, False)
+    for start in range(0, len(motion), piece):
+        stop = min(start + piece, len(motion))
+        parts += refiner.push(motion.sliced(start, stop), known.part(slice(start, stop)))
+    found = joined([*parts, *refiner.finish()])
+    left, right = (found.joint(name).t - motion.joint(name).t for name in WRISTS)
+    torch.testing.assert_close(right[:, 2], torch.full((len(motion),), 0.05), atol=1e-3, rtol=0)
+    share = torch.zeros(len(motion))
+    share[40:90] = (torch.arange(1, 51) / fade).clamp_max(1)
+    torch.testing.assert_close(left[:90, 2], 0.05 * share[:90], atol=1e-3, rtol=0)
+    assert left[90 + fade :].norm(dim=-1).max() < 1e-4, "as predicted again"
+    assert left.diff(dim=0).norm(dim=-1).max() < 0.1, "and no jump on the way"
 
 
 def test_arms_reach_tracked_wrists_or_as_near_as_they_can():

@@ -173,7 +173,8 @@ class EchoContent(Content):
         for name in poses:
             # Nothing is between the poses of two objects.
             values[name][changes] = true[name][cut.frames[changes]]
-        sensed = track.points._asdict() | {"floor_height": track.floor_height}
+        R, t, _ = track.points
+        sensed = {"R_world_point": R, "t_world_point": t, "floor_height": track.floor_height}
         values |= {name: cut.take(name, part, sensed=True) for name, part in sensed.items()}
         values |= {"size": track.size, "t_parent_joint": track.skeleton.t_parent_joint}
         return Window(values, track.twins)

@@ -1,4 +1,4 @@
-"""Conditions of a window beside the head's path: codes of the points around the body, and image embeddings."""
+"""Conditions of a window beside the head's path: codes of the points around the body, image embeddings, hands in view."""
 
 import hashlib
 import re
@@ -12,10 +12,18 @@ from jaxtyping import Bool, Float, Float64, Int, Int64
 from rich.progress import track
 from torch import Tensor
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.boundary.tensors import read_tensors, write_tensors
+from wearcap.data.batch import Batch
+from wearcap.data.bodies import places_in_parts
+from wearcap.data.packing import Track
+from wearcap.data.view import HandsInView
 from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
 from wearcap.models.checkpoint import load_network
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.recording import Recording
 from wearcap.recording.store import Entry, RecordingFile, RecordingStore
 from wearcap.scene.voxels import VoxelMap, mirrored
 
@@ -27,12 +35,13 @@ _AT_ONCE = 2048
 
 Rows = tuple[Float[Tensor, "row side feature"], Int[Tensor, "time"]]
 """Features of a recording, on both sides of a mirror, and the row of each frame (-1: it has none)."""
-Features = tuple[Float[Tensor, "time feature"], Bool[Tensor, "time"]]
+Features = tuple[Float[Tensor, "*batch time feature"], Bool[Tensor, "*batch time"]]
 """Features of a condition, and which frames have them; elsewhere they are any finite numbers."""
 
 
 class ConditionWindows:
-    """A condition in training windows: its features at the frames of a recording's head stream."""
+    """A condition in training windows: its features at the frames of a recording's head stream, of rows of a table or, by
+    other `track` and `read`, of further values of the windows."""
 
     metric: ClassVar[bool] = False
     """Whether features depend on lengths, so that windows cannot be scaled."""
@@ -43,6 +52,10 @@ class ConditionWindows:
 
     key: str = ""
     """What the features depend on beside the recording."""
+    twins: ClassVar[dict[str, list[int]]] = {}
+    sensed: ClassVar[frozenset[str]] = frozenset()
+    parts: ClassVar[frozenset[str]] = frozenset()
+    """Of the values that it adds to windows: see `Batch`."""
 
     def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
         """Make or check what reading the recordings of a split needs."""
@@ -50,6 +63,23 @@ class ConditionWindows:
     def frames(self, store: RecordingStore, name: str) -> Rows:
         """Features of a recording, of everything as it is and mirrored left to right, and the row of each head pose."""
         raise NotImplementedError
+
+    def track(self, name: str, store: RecordingStore, recording: Recording, stem: str) -> Track:
+        """What is kept of a recording for the condition of a name."""
+        table, row = self.frames(store, stem)
+        return Track({name: row}, {}, {name: table})
+
+    def read(self, name: str, batch: Batch, values: dict[str, Tensor]) -> Features:
+        """Features of a batch of windows, and which frames have them; takes what is its own out of the windows' values.
+
+        Nobody else has the surroundings that a recording was made in."""
+        row, side = values.pop(name), torch.zeros_like(batch.track)
+        if batch.mirrored is not None:
+            side = batch.mirrored.long()
+        given = row >= 0
+        if batch.others is not None:
+            given = given & ~batch.others[:, None]
+        return batch.packed.tables[name][row, side[:, None]].float(), given
 
 
 class PlaceCodes(ConditionWindows):
@@ -146,6 +176,45 @@ class Embeddings(ConditionWindows):
         table = torch.stack([file.tensor("camera.embedding"), file.tensor("camera.embedding_mirrored")], 1)
         picture, valid = latest_before(file.tensor("camera.timestamps"), file.tensor("head.timestamps"))
         return table.half(), torch.where(valid, picture, -1).int()
+
+
+HAND = 10
+"""Features of a hand: whether it is seen, its place (m) and its orientation in 6D."""
+
+
+def hand_features(
+    T_world_head: Rigid, T_world_wrist: Rigid, seen: Bool[Tensor, "*batch time hand"]
+) -> Float[Tensor, "*batch time feature"]:
+    """Both hands from the head, along its heading: 1, place and orientation of a hand that is seen, otherwise zeros."""
+    heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R)).mT[..., None, :, :]
+    t = (heading @ (T_world_wrist.t - T_world_head.t[..., None, :])[..., None])[..., 0]
+    R = rotation.rot6d_from_matrix(heading @ T_world_wrist.R)
+    shown = seen[..., None]
+    return torch.where(shown, torch.cat([shown.to(t), t, R], -1), 0.0).flatten(-2)
+
+
+class SeenHands(ConditionWindows):
+    """True wrists where a head-mounted device would find them."""
+
+    size = HAND * len(WRISTS)
+    twins: ClassVar[dict[str, list[int]]] = {"R_world_wrist": [1, 0], "t_world_wrist": [1, 0]}
+    sensed = frozenset(twins)
+    parts = frozenset({"t_world_wrist"})
+
+    def __init__(self, view: HandsInView | None = None):
+        self.view = view or HandsInView()
+
+    def track(self, name: str, store: RecordingStore, recording: Recording, stem: str) -> Track:
+        motion = recording.motion
+        assert motion is not None
+        R_world_wrist = motion.T_world_joint.R[:, motion.skeleton.indices(*WRISTS)]
+        return Track({"R_world_wrist": R_world_wrist, "t_world_wrist": places_in_parts(motion, WRISTS)})
+
+    def read(self, name: str, batch: Batch, values: dict[str, Tensor]) -> Features:
+        T_world_wrist = Rigid(values.pop("R_world_wrist"), values.pop("t_world_wrist"))
+        T_world_head = Rigid(values["R_world_head"], values["t_world_head"])
+        seen = self.view(T_world_head, T_world_wrist.t, batch)
+        return hand_features(T_world_head, T_world_wrist, seen), seen.any(-1)
 
 
 _ENCODER_NAME = re.compile(r"[\w.-]+")

@@ -8,7 +8,7 @@ speed. Random numbers come from the batch's `Draws`, by names that no other tran
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -152,14 +152,15 @@ class SensorErrors:
     axis and of positions along each. Values that a window lacks are left out.
     """
 
-    head_deg: float = 0.0
+    head_deg: float | Sequence[float] = 0.0
+    """How the device sits on the head: about the head's x, y and z axis, if there are three (roll, pitch, yaw)."""
     wrist_deg: float = 0.0
     """Orientation of a wrist's sensor: strap, attitude, heading."""
     acc_m_s2: float = 0.0
     """White noise of accelerations."""
     floor_m: float = 0.0
-    head_m: float = 0.0
-    """Where the device sits on the head, in the head's axes."""
+    head_m: float | Sequence[float] = 0.0
+    """Where the device sits on the head, in the head's axes: forward, left, up, if there are three."""
     wrist_m: float = 0.0
     """Where a wrist's sensor is, in its own axes: a watch there has that place's acceleration."""
     size: float = 0.0
@@ -185,8 +186,9 @@ def _constant(batch: Batch, errors: SensorErrors) -> Batch:
     turn, seat = {}, {}
     for name, deg, metres in (head, wrist):
         count = 1 if name == "head" else 2
-        turn[name] = rotation.exp(math.radians(deg) * draws.normal(f"{name} turned", 1, count, 3))
-        seat[name] = metres * draws.normal(f"{name} seat", 1, count, 3)
+        turned, moved = draws.normal(f"{name} turned", 1, count, 3), draws.normal(f"{name} seat", 1, count, 3)
+        turn[name] = rotation.exp(turned.new_tensor(deg).deg2rad() * turned)
+        seat[name] = moved.new_tensor(metres) * moved
     turn["point"], seat["point"] = (torch.cat([each["head"], each["wrist"]], 2) for each in (turn, seat))
     turn["head"], seat["head"] = turn["head"][:, :, 0], seat["head"][:, :, 0]
     if (acc := values.get("acc_world_wrist")) is not None:

@@ -55,8 +55,8 @@ class Content:
     """Whether people of other proportions can do a motion."""
     own_rate: ClassVar[bool] = False
     """Whether a track has the rate of the windows, not the recording's."""
-    sensed: ClassVar[frozenset[str]] = frozenset()
-    parts: ClassVar[frozenset[str]] = frozenset()
+    sensed: frozenset[str] = frozenset()
+    parts: frozenset[str] = frozenset()
     jumps: ClassVar[dict[str, str]] = {}
     """See `Batch`."""
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
 
 MAX_TIME_S = 1e10
 """Largest valid time (s): beyond it a double no longer resolves a microsecond; Unix times are 1.7e9 s."""
@@ -293,6 +294,25 @@ class WristInput:
             if place == len(samples) or samples[place][0] != time:
                 samples.insert(place, accepted)
                 del samples[:-MAX_WAITING]
+
+    def add_pose(self, joint: str, timestamp: object, T_world_joint: object) -> None:
+        """Buffer a tracked pose of a wrist, unless it is invalid, which is counted as refused."""
+        if fault := time_fault(timestamp) or pose_fault(T_world_joint):
+            self.head.refuse(joint, fault)
+            return
+        assert isinstance(timestamp, float | int)
+        assert isinstance(T_world_joint, Rigid)
+        self.add(joint, (float(timestamp), owned(T_world_joint.R), owned(T_world_joint.t)))
+
+    def track(self, joint: str, time: float) -> Trajectory | None:
+        """Tracked poses of a wrist so far; None without any. Those of more than a second before a time are dropped, but one."""
+        samples = self.samples[joint]
+        if not samples:
+            return None
+        times, R, t = zip(*samples)
+        old = bisect_left(times, time - 1.0) - 1
+        self.samples[joint] = samples[max(old, 0) :]
+        return Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
 
     def rejoin(self, time: float | None) -> None:
         """Keep the samples that belong to the head's clock starting at a time (s); None: drop all of them."""

@@ -13,6 +13,7 @@ import torch
 from einops import rearrange, reduce
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from wearcap.body.kinematics import local_rotations, site_positions
 from wearcap.body.retarget import reach
@@ -31,6 +32,8 @@ _REACH = 2.5
 _STRAIGHT, _SOFT = 0.97, 0.025
 """Share of a leg's length from which a farther goal is approached ever more slowly, and the share within which."""
 
+FADE_S = 0.25
+"""Time (s) within which arms go over to wrists that come into view, and leave those that were lost."""
 _SURELY_M = 0.02
 """Displacement (m) of a foot from which a knee that was predicted to bend backwards bends forward."""
 
@@ -45,16 +48,26 @@ class Measured(NamedTuple):
     R_world_wrist: Float[Tensor, "time wrist 3 3"]
     """Orientations of the tracked wrists; none of systems that do not track them."""
     t_world_wrist: Float[Tensor, "time wrist 3"]
+    seen: Bool[Tensor, "time wrist"]
+    """Where each is tracked; elsewhere its pose is any."""
     given: Bool[Tensor, "time"]
     """Frames whose whole body is given, which stay as they are."""
 
     @classmethod
-    def of(cls, T_world_head: Rigid, floor_height: Float[Tensor, "time"], T_world_wrist: Rigid | None = None):
-        """Measurements of head, floor and, where they are tracked, wrists (R "time wrist 3 3"); no body is given."""
+    def of(
+        cls,
+        T_world_head: Rigid,
+        floor_height: Float[Tensor, "time"],
+        T_world_wrist: Rigid | None = None,
+        seen: Bool[Tensor, "time wrist"] | None = None,
+    ):
+        """Measurements of head, floor and, where they are tracked, wrists (R "time wrist 3 3"; None: everywhere); no body
+        is given."""
         count = len(floor_height)
         wrists = T_world_wrist or Rigid(torch.zeros(count, 0, 3, 3), torch.zeros(count, 0, 3))
+        seen = torch.ones_like(wrists.t[..., 0], dtype=torch.bool) if seen is None else seen
         given = torch.zeros(count, dtype=torch.bool)
-        return cls(T_world_head.R, T_world_head.t, floor_height, wrists.R, wrists.t, given)
+        return cls(T_world_head.R, T_world_head.t, floor_height, wrists.R, wrists.t, seen, given)
 
     def part(self, frames: slice) -> "Measured":
         """A range of frames."""
@@ -123,6 +136,8 @@ class Refiner:
         self._smooth: tuple[Motion, Measured] | None = None
         """Frames that are smooth, but not final."""
         self._states = tuple(FootState() for _ in range(FEET))
+        self._wrists: Measured | None = None
+        """The last final frames, as far as later ones ask whether wrists were tracked."""
 
     def push(self, motion: Motion, measured: Measured) -> list[Motion]:
         """Take in the next frames; returns those that are final now, as a list of at most one motion.
@@ -157,10 +172,27 @@ class Refiner:
         final, self._smooth = _split(self._smooth, count)
         assert final is not None
         motion, measured = final
-        wrists = None
+        wrists = share = None
         if self.refinement.wrists and measured.t_world_wrist.shape[1]:
-            wrists = Rigid(measured.R_world_wrist, measured.t_world_wrist)
-        return [_except_given(with_limbs_bent(motion, offsets, wrists), motion, measured.given)]
+            wrists, share = self._reached(measured)
+        return [_except_given(with_limbs_bent(motion, offsets, wrists, share), motion, measured.given)]
+
+    def _reached(self, measured: Measured) -> tuple[Rigid, Float[Tensor, "time wrist"] | None]:
+        """Where wrists are or were last tracked, and the share by which arms reach there: of the last `FADE_S` in which each was
+        tracked, so that it grows and falls as long. None: all by the whole."""
+        fade = max(1, round(FADE_S * self.fps))
+        before = measured.part(slice(0, 1)) if self._wrists is None else self._wrists
+        known = Measured(*(torch.cat(both) for both in zip(before, measured)))
+        self._wrists = known.part(slice(-fade, None))
+        if known.seen.all():
+            return Rigid(measured.R_world_wrist, measured.t_world_wrist), None
+        count, whole = len(measured.seen), len(known.seen)
+        missing = fade - 1 - (whole - count)
+        seen = torch.cat([known.seen[:1].expand(max(0, missing), -1), known.seen]).float()
+        share = F.avg_pool1d(seen.T[None], fade, 1)[0].T[-count:]
+        last = torch.where(known.seen, torch.arange(whole)[:, None], 0).cummax(0).values[-count:]
+        hand = torch.arange(last.shape[1])
+        return Rigid(known.R_world_wrist[last, hand], known.t_world_wrist[last, hand]), share
 
     def _smoothed(self, piece: tuple[Motion, Measured]) -> tuple[Motion, Measured]:
         """The next frames with the average of their neighbours, anchored to the head."""
@@ -212,17 +244,24 @@ def refined_over(
 
 
 def with_limbs_bent(
-    motion: Motion, foot_offset: Float[Tensor, "time foot 3"] | None = None, T_world_wrist: Rigid | None = None
+    motion: Motion,
+    foot_offset: Float[Tensor, "time foot 3"] | None = None,
+    T_world_wrist: Rigid | None = None,
+    share: Float[Tensor, "time wrist"] | None = None,
 ) -> Motion:
     """The motion with its ankles moved by an offset in the world (m), hips and knees following, feet turned as before, and
     with both wrists turned as measured, and where they were measured or as near as the arms reach; None: these stay.
 
-    Knees bend forward, and a leg never becomes straighter than it can.
+    `share`: of the way from where each wrist is to there; None: all of it. Knees bend forward, and a leg never becomes straighter than it can.
     """
     feet_move = foot_offset is not None and bool(foot_offset.any())
     if not feet_move and T_world_wrist is None:
         return motion
     skeleton, T = motion.skeleton, motion.T_world_joint
+    if T_world_wrist is not None and share is not None:
+        own = skeleton.indices(*WRISTS)
+        R = rotation.between(T.R[:, own], T_world_wrist.R, share)
+        T_world_wrist = Rigid(R, torch.lerp(T.t[:, own], T_world_wrist.t, share[..., None]))
     limbs: list[_Limbs] = []
     if foot_offset is not None and feet_move:
         limbs.append(_legs(skeleton, T, foot_offset.double()))

@@ -137,7 +137,7 @@ class GuidedScene:
         for wrist, points in HANDS.items():
             at = self.conditioning.t_world_point[:, :, POINTS.index(wrist)]
             local = (T_object.R.mT @ (at - T_object.t)[..., None])[..., 0]
-            holds = in_contact[..., points].any(-1)
+            holds = in_contact[..., points].any(-1) & self.conditioning.seen[:, :, POINTS.index(wrist)]
             slip = slip + (local.diff(dim=1).square().sum(-1) * (same & holds[:, 1:] & holds[:, :-1])).sum()
         return slip
 

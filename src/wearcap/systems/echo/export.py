@@ -87,6 +87,7 @@ def condition_channels(features: EchoFeatures) -> list[str]:
         *(f"{point}.velocity_{axis}" for point in POINTS for axis in "xyz"),
         *heading,
         *wearer,
+        *(f"{point}.seen" for point in POINTS[1:] if features.gaps),
     ]
 
 

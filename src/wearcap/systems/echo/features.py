@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, mirrored_points
@@ -38,6 +38,8 @@ class ThreePoints(NamedTuple):
 
     R_world_point: Float[Tensor, "*batch time point 3 3"]
     t_world_point: Float[Tensor, "*batch time point 3"]
+    seen: Bool[Tensor, "*batch time point"] | None = None
+    """Which points are tracked in each frame; None: all are."""
 
 
 class Body(NamedTuple):
@@ -69,6 +71,8 @@ class EchoFeatures:
     """Frame rate of the model (Hz)."""
     points: Sequence[str] = POINTS
     """Tracked points that the condition has, the head first: all, or for a baseline the head alone."""
+    gaps: bool = False
+    """Whether wrists may be missing at any frame (ours): zeros then, and a feature of each says whether it is there."""
 
     def __post_init__(self):
         require_choice(self.frame, FRAMES, f"ECHO has no frame {self.frame!r}")
@@ -78,9 +82,10 @@ class EchoFeatures:
 
     @property
     def condition_size(self) -> int:
-        """Features per frame: 18 for each point (ECHO: 54), 2 of the heading if frame is "own", and the head's height and
-        limb lengths."""
-        return 18 * len(self.points) + (2 if self.frame == "own" else 0) + (1 + len(LIMBS) if self.body else 0)
+        """Features per frame: 18 for each point (ECHO: 54), 2 of the heading if frame is "own", the head's height and
+        limb lengths, and with `gaps` one for each wrist."""
+        flags = len(self.points) - 1 if self.gaps else 0
+        return 18 * len(self.points) + (2 if self.frame == "own" else 0) + (1 + len(LIMBS) if self.body else 0) + flags
 
     @property
     def human_size(self) -> int:
@@ -127,7 +132,7 @@ class EchoFeatures:
         `frame`: the canonical frame of the points, if it was computed already.
         """
         frame = self.canonical(points) if frame is None else frame
-        R, t = (part[:, :, : len(self.points)] for part in points)
+        R, t = (part[:, :, : len(self.points)] for part in points[:2])
         R_canonical_world = frame.R.mT[:, :, None]
         turn = torch.cat([torch.eye(3).to(R).expand_as(R[:, :1]), R[:, :-1].mT @ R[:, 1:]], 1)
         step = t.diff(dim=1) * self.fps
@@ -136,11 +141,16 @@ class EchoFeatures:
         # The yaw-aligned frame of the window's first head pose.
         first = Rigid(rotation.about_axis("z", rotation.yaw_of(R[:, :1, 0])), t[:, :1, 0])
         parts = [
-            rotation.rot6d_from_matrix(R_canonical_world @ R).flatten(-2),
-            rotation.rot6d_from_matrix(turn).flatten(-2),
-            positions.flatten(-2),
-            (R_canonical_world @ step[..., None])[..., 0].flatten(-2),
+            rotation.rot6d_from_matrix(R_canonical_world @ R),
+            rotation.rot6d_from_matrix(turn),
+            positions,
+            (R_canonical_world @ step[..., None])[..., 0],
         ]
+        seen = torch.ones_like(t[..., 0], dtype=torch.bool) if points.seen is None else points.seen
+        if self.gaps:
+            both = seen & torch.cat([seen[:, :1], seen[:, :-1]], 1)
+            parts = [torch.where(where[..., None], part, 0.0) for where, part in zip((seen, both, seen, both), parts)]
+        parts = [part.flatten(-2) for part in parts]
         if self.frame == "own":
             # The head is at its own origin: its position and heading are relative to the window's first head instead.
             parts[2] = torch.cat([first.inverse() @ t[:, :, 0], parts[2][..., 3:]], -1)
@@ -148,6 +158,8 @@ class EchoFeatures:
         if self.body:
             height = (t[:, :, 0, 2] - floor_height)[..., None] / size[:, None, :1]
             parts += [height, size[:, None].expand(-1, t.shape[1], -1)]
+        if self.gaps:
+            parts.append(seen[..., 1:].to(t))
         return torch.cat(parts, -1)
 
     def encode_body(self, body: Body, frame: Rigid) -> Float[Tensor, "batch time human"]:

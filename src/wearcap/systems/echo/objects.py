@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import MIRROR
@@ -167,6 +167,7 @@ class ActiveObjects:
         t_world_point: Float[Tensor, "time point 3"],
         floor_height: Float[Tensor, "time"],
         joints: int,
+        seen: Bool[Tensor, "time point"],
     ) -> Conditioning:
         """Frames with these tracked points, of which only objects are observed, as a batch of one."""
         count, nothing = len(timestamps), self._reader.nothing.expand(len(timestamps), -1)
@@ -174,7 +175,7 @@ class ActiveObjects:
         objects = none, nothing, nothing, torch.full((count,), float(NO_OBJECT))
         body = eye[:, None].repeat(1, joints, 1, 1), zeros
         unobserved = *body, eye, zeros, torch.zeros(count, CONTACTS), none[:, None].repeat(1, len(MODALITIES))
-        fields = timestamps, R_world_point, t_world_point, floor_height, *objects, ~none, *unobserved
+        fields = timestamps, R_world_point, t_world_point, floor_height, *objects, ~none, *unobserved, seen
         return self.updated(Conditioning(*(field[None] for field in fields)))
 
     def updated(self, frames: Conditioning) -> Conditioning:

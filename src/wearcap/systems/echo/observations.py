@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.body.contact_points import BODY_POINTS
@@ -23,6 +23,7 @@ from wearcap.systems.echo.objects import ActiveObjects, ObjectReader, ObjectShap
 from wearcap.systems.echo.queue import Conditioning
 from wearcap.tracking.floor import CARRIED
 from wearcap.tracking.head_path import HeadPath
+from wearcap.tracking.wrists import seen_wrist
 
 MAX_GAP_S = 0.5
 """Longest gap in a wrist's tracking that is interpolated (s)."""
@@ -77,48 +78,58 @@ def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> B
     mesh or class cannot be used, and for observations beyond the recording.
     """
     recording = scenario.recording
-    R, t = _tracked_points(recording, path)
+    R, t, seen = _tracked_points(recording, path, reader.features.gaps)
     floor = path.floor_below(CARRIED)
     if recording.floor is not None:
         floor = interpolate_clamped(recording.floor.timestamps, recording.floor.height, path.timestamps)
     objects = _active_objects(scenario, path, reader)
-    frames = objects.frames(path.timestamps, R, t, floor.float(), len(path.skeleton))
+    frames = objects.frames(path.timestamps, R, t, floor.float(), len(path.skeleton), seen)
     return BatchItem(path, _with_observed(scenario, path, frames), objects.shapes)
 
 
 def _tracked_points(
-    recording: Recording, path: HeadPath
-) -> tuple[Float[Tensor, "time point 3 3"], Float[Tensor, "time point 3"]]:
-    """Measured head and tracked wrists; the ground-truth wrists if the recording tracks none."""
-    poses = [path.T_world_head]
-    truth = recording.motion
-    found = [joint for joint in WRISTS if joint in recording.tracked]
-    if len(found) == 1:
+    recording: Recording, path: HeadPath, gaps: bool
+) -> tuple[Float[Tensor, "time point 3 3"], Float[Tensor, "time point 3"], Bool[Tensor, "time point"]]:
+    """Measured head and tracked wrists, and where each is tracked; the ground-truth wrists if the recording tracks none.
+
+    `gaps`: whether the network knows of wrists that are missing; otherwise their last pose stands in.
+    """
+    where, found = recording.name, [joint for joint in WRISTS if joint in recording.tracked]
+    seen = torch.ones(len(path.timestamps), 3, dtype=torch.bool)
+    poses, truth = [path.T_world_head], recording.motion
+    if len(found) == 1 and not gaps:
         expected = f"`tracked` poses of {' and '.join(WRISTS)}"
-        raise WearcapError(f"only {found[0]} is tracked", where=recording.name, expected=expected)
+        raise WearcapError(f"only {found[0]} is tracked", where=where, expected=expected)
     if found:
-        for joint in found:
-            track = recording.tracked[joint]
-            _require_times(track.timestamps, path, f"tracking of {joint}", recording.name)
-            poses.append(wrist_poses(track, path.timestamps))
+        for number, joint in enumerate(WRISTS, 1):
+            track = recording.tracked.get(joint)
+            if track is not None:
+                _require_times(track.timestamps, path, f"tracking of {joint}", where, gaps)
+            if gaps:
+                pose, seen[:, number] = seen_wrist(track, path.timestamps)
+            else:
+                assert track is not None
+                pose = wrist_poses(track, path.timestamps)
+            poses.append(pose)
     elif truth is not None:
         times = path.timestamps.clamp(truth.timestamps[0].item(), truth.timestamps[-1].item())
         truth = at_times(truth, times)
         poses += [truth.joint(joint) for joint in WRISTS]
     else:
         expected = f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion"
-        raise WearcapError("this recording has no tracked wrists", where=recording.name, expected=expected)
+        raise WearcapError("this recording has no tracked wrists", where=where, expected=expected)
     R, t = torch.stack([T.R.float() for T in poses], 1), torch.stack([T.t.float() for T in poses], 1)
     if not (R.isfinite().all() and t.isfinite().all()):
-        raise WearcapError("poses of wrists that are NaN or infinite", where=recording.name, expected="finite poses")
-    heading = rotation.about_axis("z", rotation.yaw_of(R[:, 0]))
-    apart = (heading.mT @ (t[:, 1] - t[:, 2])[..., None])[:, 1, 0].median().item()
+        raise WearcapError("poses of wrists that are NaN or infinite", where=where, expected="finite poses")
     # Wrists of a ground-truth motion cannot be swapped trackers: the wearer crosses the arms.
-    if found and apart < -SWAPPED_M:
-        what = f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median"
-        expected = "the left wrist on the left"
-        raise WearcapError(what, where=recording.name, expected=expected, fix="Swap the two trackers.")
-    return R, t
+    both = seen[:, 1] & seen[:, 2]
+    if found and both.any():
+        heading = rotation.about_axis("z", rotation.yaw_of(R[both, 0]))
+        apart = (heading.mT @ (t[both, 1] - t[both, 2])[..., None])[:, 1, 0].median().item()
+        if apart < -SWAPPED_M:
+            what = f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median"
+            raise WearcapError(what, where=where, expected="the left wrist on the left", fix="Swap the two trackers.")
+    return R, t, seen
 
 
 def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
@@ -135,13 +146,13 @@ def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
     return Rigid(torch.where(gone[:, None, None], held.R, found.R), torch.where(gone[:, None], held.t, found.t))
 
 
-def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, where: str) -> None:
+def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, where: str, gaps: bool) -> None:
     if len(times) < 2 or not (times.diff() > 0).all():
         raise WearcapError(
             f"{what} at {len(times)} times that do not increase", where=where, expected="increasing timestamps (s)"
         )
     late, early = times[0] - path.timestamps[0], path.timestamps[-1] - times[-1]
-    if max(late.item(), early.item()) > 0.5:
+    if not gaps and max(late.item(), early.item()) > 0.5:
         expected = f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head"
         raise WearcapError(f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where, expected=expected)
 

@@ -355,7 +355,8 @@ def measured_of(item: BatchItem) -> Measured:
     """What one batch item's refinement knows: head, floor, tracked wrists, and frames whose body is observed."""
     conditioning = item.conditioning
     wrists = Rigid(conditioning.R_world_point[0, :, 1:], conditioning.t_world_point[0, :, 1:])
-    measured = Measured.of(item.path.T_world_head, conditioning.floor_height[0], wrists)
+    seen = conditioning.seen[0, :, 1:]
+    measured = Measured.of(item.path.T_world_head, conditioning.floor_height[0], wrists, seen)
     return measured._replace(given=conditioning.is_observed[0, :, 0])
 
 

@@ -51,6 +51,8 @@ class Conditioning(NamedTuple):
     contact: Float[Tensor, "batch frame contact"]
     """These five are observed values; arbitrary in frames whose modality is not observed."""
     is_observed: Bool[Tensor, "batch frame modality"]
+    seen: Bool[Tensor, "batch frame point"]
+    """Which of the three points are tracked; others' poses are any."""
 
     def frames(self, part: slice | Tensor) -> "Conditioning":
         """A selection of frames."""
@@ -71,6 +73,7 @@ class Conditioning(NamedTuple):
             R_world_object=self.R_world_object * turn,
             t_world_object=self.t_world_object * flip,
             contact=self.contact[..., TWIN_CONTACTS],
+            seen=self.seen[..., TWIN_POINTS],
         )
 
     @property
@@ -81,7 +84,7 @@ class Conditioning(NamedTuple):
     @property
     def points(self) -> ThreePoints:
         """The three tracked points."""
-        return ThreePoints(self.R_world_point, self.t_world_point)
+        return ThreePoints(self.R_world_point, self.t_world_point, self.seen)
 
 
 class Outputs(NamedTuple):

@@ -5,7 +5,6 @@ latency of a pose is `Echo.latency_s`. Memory use is bounded.
 """
 
 import math
-from bisect import bisect_left
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,7 +16,6 @@ from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.active_objects import changes
 from wearcap.runtime.graphs import undisturbed
 from wearcap.runtime.session import HeadAndWristsStream, Session
@@ -35,6 +33,7 @@ from wearcap.systems.echo.pipeline import Echo, measured_of, motion_of, pulled_b
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
 from wearcap.tracking.floor import CARRIED, FloorTracker
 from wearcap.tracking.head_path import Chunk, HeadPath
+from wearcap.tracking.wrists import seen_wrist
 
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
@@ -76,10 +75,7 @@ class EchoStream(HeadAndWristsStream):
         """
         if joint not in WRISTS:
             raise WearcapError(f"no tracked joint {joint!r}", expected=" or ".join(WRISTS))
-        if fault := packets.time_fault(timestamp) or packets.pose_fault(T_world_joint):
-            self._head_input.refuse(joint, fault)
-            return
-        self._wrists.add(joint, (float(timestamp), packets.owned(T_world_joint.R), packets.owned(T_world_joint.t)))
+        self._wrists.add_pose(joint, timestamp, T_world_joint)
 
     def take(self, sample: Any) -> None:
         """Take in one sample of the head device, a wrist or an object, or the choice of the active object."""
@@ -149,28 +145,26 @@ class EchoStream(HeadAndWristsStream):
 
     def _frame(self, timestamps: Float64[Tensor, "1"], T_world_head: Rigid) -> Conditioning:
         poses, time = [T_world_head], timestamps.item()
-        for joint in WRISTS:
-            seen = self._wrists.samples[joint]
-            if not seen or seen[-1][0] < time - MAX_GAP_S:
+        there, gaps = torch.ones(1, 3, dtype=torch.bool), self.pipeline.model.features.gaps
+        for number, joint in enumerate(WRISTS, 1):
+            track = self._wrists.track(joint, time)
+            if track is None or track.timestamps[-1] < time - MAX_GAP_S:
                 self.silent += 1
-            if seen:
-                times, R, t = zip(*seen)
-                track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
+            if track is not None:
                 pose = wrist_poses(track, timestamps)
+                there[:, number] = seen_wrist(track, timestamps)[1] if gaps else True
                 poses.append(Rigid(pose.R.float(), pose.t.float()))
-                # Only the last second is needed, and one pose before it.
-                old = bisect_left(seen, time - 1.0, key=lambda pose: pose[0]) - 1
-                self._wrists.samples[joint] = seen[max(old, 0) :]
             else:  # a wrist that was not tracked yet is beside the body, with the arm down
                 heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
                 aside = ASIDE_M if joint == WRISTS[0] else -ASIDE_M
                 below = torch.tensor([0.0, aside, -BELOW * self.wearer.skeleton.height_of("head")])
                 poses.append(Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0]))
+                there[:, number] = not gaps
         R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
         floor = torch.full((1,), self.wearer.floor_m or 0.0)
         if self.wearer.floor_m is None:
             floor = self._floor.follow(T_world_head.t)
-        return self._objects.frames(timestamps, R, t, floor, len(self.wearer.skeleton))
+        return self._objects.frames(timestamps, R, t, floor, len(self.wearer.skeleton), there)
 
     def _take(self, ended: bool) -> None:
         if (found := self.windows.take(ended)) is None:

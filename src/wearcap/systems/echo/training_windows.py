@@ -16,6 +16,7 @@ from wearcap.data.bodies import bones_in_parts, head_in_parts, places_in_parts, 
 from wearcap.data.features import on_level_ground
 from wearcap.data.packing import Track
 from wearcap.data.transforms import joint_twins
+from wearcap.data.view import HandsInView
 from wearcap.data.windows import Content
 from wearcap.diffusion.levels import DRAWS
 from wearcap.geometry import rotation
@@ -56,6 +57,8 @@ class EchoWindow(NamedTuple):
 
     R_world_point: Float[Tensor, "batch time point 3 3"]
     t_world_point: Float[Tensor, "batch time point 3"]
+    seen: Bool[Tensor, "batch time point"]
+    """Which of the points are tracked in each frame."""
     floor_height: Float[Tensor, "batch time"]
     size: Float[Tensor, "batch limb"]
     """`body_size` of the wearer (m)."""
@@ -87,7 +90,7 @@ class EchoWindow(NamedTuple):
     @property
     def points(self) -> ThreePoints:
         """The three tracked points."""
-        return ThreePoints(self.R_world_point, self.t_world_point)
+        return ThreePoints(self.R_world_point, self.t_world_point, self.seen)
 
     @property
     def body(self) -> Body:
@@ -234,7 +237,7 @@ class EchoContent(Content):
     """
 
     any_body = own_rate = True
-    sensed = frozenset({*ThreePoints._fields, "floor_height"})
+    sensed = frozenset({"R_world_point", "t_world_point", "floor_height"})
     parts = frozenset({"t_world_point", "t_parent_joint", "size"})
     jumps: ClassVar[dict[str, str]] = {
         f"{kind}_world_{name}": "object" for name in ("object", *CANONICAL) for kind in "Rt"
@@ -247,13 +250,15 @@ class EchoContent(Content):
         within_m: float = TOUCH_M,
         objects: bool = True,
         canonical: bool = True,
+        view: HandsInView | None = None,
     ):
-        """`encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: no shape feature.
+        """`view`: where wrists are found, for features with `gaps`; None: everywhere. `encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: no shape feature.
 
         A body point is in contact within `within_m` of the object's surface. With `objects` False all recordings are of
         humans alone. `canonical`: objects' poses that nobody observed are to be found modulo their symmetry (ours). Raises WearcapError when the checkpoint is missing, damaged or another network's.
         """
         self.features, self.within_m, self.objects, self.canonical = features, within_m, objects, canonical
+        self.view = view if features.gaps else None
         if isinstance(encoder, str):
             encoder = load_network(encoder, PointNeXt, "object_encoder", part="net.encoder").requires_grad_(False)
         self.encoder = encoder
@@ -296,8 +301,14 @@ class EchoContent(Content):
             known = torch.where(which, other, own) if self.canonical else values[f"{kind}_world_object"]
             values[f"{kind}_world_canonical"] = known
         values["contact"] = values["contact"].float()
+        t_world_point = values["t_world_point"]
+        seen = torch.ones_like(t_world_point[..., 0], dtype=torch.bool)
+        if self.view is not None:
+            T_world_head = Rigid(values["R_world_point"][:, :, 0], t_world_point[:, :, 0])
+            seen[..., 1:] = self.view(T_world_head, t_world_point[:, :, 1:], batch)
         return EchoWindow(
             **values,
+            seen=seen,
             has_object=row != NO_OBJECT,
             object_code=code,
             object_mean=mean,

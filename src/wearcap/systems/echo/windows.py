@@ -165,7 +165,7 @@ class AveragedWindows(Rewindow):
         return EchoQueue.run(self, whole)
 
 
-_GIVEN, _ALIKE = 1 + len(MODALITIES) + 3 * 12 + 12, 1e-4
+_GIVEN, _ALIKE = 1 + len(MODALITIES) + 3 * 13 + 12, 1e-4
 """Values of `_given`, and the difference up to which they are the same."""
 
 
@@ -173,7 +173,7 @@ def _given(conditioning: Conditioning) -> Float[Tensor, "batch frame value"]:
     """What a stream may change in a frame that windows have predicted: the active object, what is observed, tracked points
     whose poses are corrected after a loss, and the observed pose of the object."""
     observed = conditioning.is_observed
-    points = conditioning.R_world_point.flatten(2), conditioning.t_world_point.flatten(2)
+    points = conditioning.R_world_point.flatten(2), conditioning.t_world_point.flatten(2), conditioning.seen.float()
     pose = torch.cat([conditioning.R_world_object.flatten(2), conditioning.t_world_object], -1)
     pose = torch.where(observed[..., 1:2], pose, 0.0)
     return torch.cat([conditioning.object_number[..., None], observed.float(), *points, pose], -1)

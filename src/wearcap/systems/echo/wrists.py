@@ -36,7 +36,8 @@ class Reaching:
         bones = self.t_parent_joint.to(human).expand(-1, human.shape[1], -1, -1)
         at = forward_kinematics(self.skeleton, *self.features.decode_body(raw, self.frame), bones).t[..., joints, :]
         away = at - self.conditioning.t_world_point
-        return (away[:, :, 1:] - away[:, :, :1]).square().sum((-1, -2))
+        miss = (away[:, :, 1:] - away[:, :, :1]).square().sum(-1)
+        return (miss * self.conditioning.seen[:, :, 1:]).sum(-1)
 
     def corrected(
         self, x0_hat: Float[Tensor, "batch frame feature"], share: float

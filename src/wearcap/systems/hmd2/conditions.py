@@ -12,9 +12,11 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from wearcap.data.surroundings import Features, latest_before
+from wearcap.body.skeleton import WRISTS
+from wearcap.data.surroundings import HAND, Features, hand_features, latest_before
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import Recording
 from wearcap.runtime.graphs import Call, Count, Graph, Run
@@ -22,6 +24,7 @@ from wearcap.scene.voxels import VoxelGrid
 from wearcap.sensors import packets
 from wearcap.sensors.packets import HeadInput
 from wearcap.systems.hmd2.places import Places
+from wearcap.tracking.wrists import seen_wrist
 
 MAX_WAITING = 1000
 """Most values that are buffered for coming head poses; the oldest are dropped."""
@@ -50,6 +53,14 @@ class Timed:
         self.times, self.values = self.times[first:], self.values[first:]
 
 
+class HeadFrames(NamedTuple):
+    """The frames of a head's path."""
+
+    timestamps: Float64[Tensor, "time"]
+    T_world_device: Rigid
+    T_world_head: Rigid
+
+
 class Sensed(NamedTuple):
     """What one wearer's devices sensed for a condition, as far as coming frames need it."""
 
@@ -57,6 +68,8 @@ class Sensed(NamedTuple):
     """The wearer's map of points."""
     values: Timed
     """The last value used, and those not used yet; NaN if refused."""
+    tracked: dict[str, Trajectory]
+    """Tracked wrists."""
 
 
 class Exported(msgspec.Struct):
@@ -102,13 +115,13 @@ class Condition:
         """Take in a checked value of a stream."""
         sensed.values.add(time, value)
 
-    def frames(self, sensed: Sensed, timestamps: Float64[Tensor, "time"], T_world_device: Rigid) -> Features | None:
+    def frames(self, sensed: Sensed, frames: HeadFrames) -> Features | None:
         """Features of the next frames; None: they have none."""
         if not len(sensed.values):
             return None
-        number, valid = latest_before(sensed.values.times, timestamps)
+        number, valid = latest_before(sensed.values.times, frames.timestamps)
         features = sensed.values.values[number].float()
-        sensed.values.forget(timestamps[-1].item())
+        sensed.values.forget(frames.timestamps[-1].item())
         return features.nan_to_num(0.0, 0.0, 0.0), valid & features.isfinite().all(-1)
 
     def graphs(self, random: torch.Generator) -> dict[str, Graph]:
@@ -139,10 +152,10 @@ class Points(Condition):
     def take(self, sensed: Sensed, time: float, value: Tensor) -> None:
         sensed.places.add(value, torch.full((len(value),), time, dtype=torch.float64))
 
-    def frames(self, sensed: Sensed, timestamps: Float64[Tensor, "time"], T_world_device: Rigid) -> Features | None:
+    def frames(self, sensed: Sensed, frames: HeadFrames) -> Features | None:
         if not sensed.places.mapped:
             return None
-        grids = sensed.places.map.voxelize(T_world_device, timestamps)
+        grids = sensed.places.map.voxelize(frames.T_world_device, frames.timestamps)
         codes = torch.cat([self.encoder.encode(part) for part in grids.split(_AT_ONCE)])
         return codes, torch.ones(len(codes), dtype=torch.bool)
 
@@ -173,6 +186,24 @@ class Images(Condition):
         sensed.values.times, sensed.values.values = camera.timestamps.contiguous(), camera.embedding
 
 
+class Hands(Condition):
+    """Wrists as far as they are seen: by cameras of glasses or a headset, or as tracked controllers (ours)."""
+
+    use, field = "hands", "wrists"
+
+    def __init__(self, size: int = HAND * len(WRISTS), encoder: None = None, drop: float = 0.0):
+        super().__init__(size, encoder, drop)
+
+    def take_all(self, sensed: Sensed, recording: Recording) -> None:
+        sensed.tracked.update({joint: recording.tracked[joint] for joint in WRISTS if joint in recording.tracked})
+
+    def frames(self, sensed: Sensed, frames: HeadFrames) -> Features | None:
+        found = [seen_wrist(sensed.tracked.get(joint), frames.timestamps) for joint in WRISTS]
+        T_world_wrist = Rigid(*(torch.stack([getattr(T, part) for T, _ in found], 1) for part in "Rt"))
+        seen = torch.stack([there for _, there in found], 1)
+        return hand_features(frames.T_world_head, T_world_wrist, seen), seen.any(-1)
+
+
 class _ExportedPlaces(VoxelAutoencoder):
     """The encoder of the points around the body, with its weights in an exported file."""
 
@@ -185,7 +216,7 @@ class _ExportedPlaces(VoxelAutoencoder):
         return self._run(grids=flat).reshape(*grids.shape[:-3], self.size)
 
 
-CONDITIONS: dict[str, type[Condition]] = {"points": Points, "image": Images}
+CONDITIONS: dict[str, type[Condition]] = {"points": Points, "image": Images, "hands": Hands}
 """Every condition by its name in configs, batches and exported graphs."""
 
 

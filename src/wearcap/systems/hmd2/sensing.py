@@ -11,7 +11,7 @@ from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import Recording
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.sensors.samples import HeadSample
-from wearcap.systems.hmd2.conditions import Sensed, Timed, side_by_side
+from wearcap.systems.hmd2.conditions import HeadFrames, Sensed, Timed, side_by_side
 from wearcap.systems.hmd2.places import EVERYTHING, Memory, Places
 from wearcap.systems.hmd2.windows import DiffusionModel, Frames
 
@@ -25,7 +25,7 @@ class Sensing:
         grid = VoxelGrid() if points is None else points.encoder.grid
         self.model, self.places = model, Places(grid, stature, model.fps, memory)
         self.used = {name: condition for name, condition in model.conditions.items() if condition.use in use}
-        self.sensed = {name: Sensed(self.places, Timed()) for name in self.used}
+        self.sensed = {name: Sensed(self.places, Timed(), {}) for name in self.used}
         """What was sensed for each condition that is used."""
         self.floors = Timed()
         """The last measured floor height (m) used, and those not used yet."""
@@ -61,6 +61,7 @@ class Sensing:
         `floor_height` (m) takes the place of floors that were measured, and these that of the floor as tracked so far.
         """
         count, conditions = len(timestamps), []
+        frames = HeadFrames(timestamps, T_world_device, T_world_head)
         if floor_height is None:
             floor_height = self.places.floor(timestamps, T_world_head.t)
             if len(self.floors):
@@ -68,7 +69,7 @@ class Sensing:
                 self.floors.forget(timestamps[-1].item())
         for name, condition in self.model.conditions.items():
             sensed = self.sensed.get(name)
-            found = None if sensed is None else condition.frames(sensed, timestamps, T_world_device)
+            found = None if sensed is None else condition.frames(sensed, frames)
             conditions.append(found or (torch.zeros(count, condition.size), torch.zeros(count, dtype=torch.bool)))
         valid = torch.ones(count, dtype=torch.bool)
         others, given = side_by_side(conditions, count)

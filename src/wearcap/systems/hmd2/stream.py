@@ -10,14 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion
 from wearcap.runtime.session import HeadStream, Session
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors import packets
-from wearcap.sensors.packets import time_fault
-from wearcap.sensors.samples import HeadSample
+from wearcap.sensors.packets import Admitted, WristInput, time_fault
+from wearcap.sensors.samples import HeadSample, WristSample
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
 from wearcap.systems.hmd2.sensing import Sensing
@@ -30,6 +31,7 @@ class HMD2Stream(HeadStream):
 
     def __init__(self, pipeline: HMD2, wearer: Wearer, seed: int, memory: Memory):
         super().__init__(pipeline, wearer, pipeline.advance, anchored=True)
+        self._wrists = WristInput(self._head_input)
         self.seed, self.memory = seed, memory
         self._begin()
 
@@ -39,10 +41,18 @@ class HMD2Stream(HeadStream):
         self.sensing = Sensing(pipeline.model, pipeline.used, stature, self.memory)
 
     def take(self, sample: Any) -> None:
-        if isinstance(sample, HeadSample):
-            self._admit(sample)
-        else:
-            self._head_input.refuse("head", packets.WRONG_TYPE)
+        """Take in one sample of the head device, or a wrist's pose, which a network without hands does not use."""
+        match sample:
+            case HeadSample():
+                self._admit(sample)
+            case WristSample() if sample.joint in WRISTS:
+                self._wrists.add_pose(*sample)
+            case _:
+                self._head_input.refuse("head", packets.WRONG_TYPE)
+
+    def _restart(self, admitted: Admitted) -> None:
+        super()._restart(admitted)
+        self._wrists.rejoin(None if admitted.again else admitted.packets[0][0])
 
     def _checked(self, sample: HeadSample) -> HeadSample:
         head, fields = self._head_input, {condition.field: condition for condition in self.sensing.used.values()}
@@ -63,6 +73,9 @@ class HMD2Stream(HeadStream):
 
     def _sensed(self, chunk: Chunk, ended: bool) -> tuple[Frames]:
         T_world_head = self._head_of(chunk.T_world_device)
+        if (hands := self.sensing.sensed.get("hands")) is not None:
+            found = {joint: self._wrists.track(joint, chunk.timestamps[0].item()) for joint in WRISTS}
+            hands.tracked.update({joint: track for joint, track in found.items() if track is not None})
         return (self.sensing.frames(chunk.timestamps, chunk.T_world_device, T_world_head),)
 
     def sense(self, ended: bool) -> bool:
@@ -116,7 +129,7 @@ class HMD2Session(Session):
     ) -> "HMD2Session":
         return cls(system, wearers, range(seed, seed + len(wearers)))
 
-    def push(self, samples: Sequence[Sequence[HeadSample]]) -> None:
+    def push(self, samples: Sequence[Sequence[Any]]) -> None:
         """Take in each wearer's new samples, any number of them.
 
         Raises WearcapError for samples of another number of wearers and, without taking anything in, for an embedding

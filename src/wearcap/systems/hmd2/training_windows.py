@@ -69,6 +69,8 @@ class HeadContent(Content):
 
     def __init__(self, conditions: Mapping[str, ConditionWindows] | None = None):
         self.conditions = dict(conditions or {})
+        self.sensed = HeadContent.sensed.union(*(each.sensed for each in self.conditions.values()))
+        self.parts = HeadContent.parts.union(*(each.parts for each in self.conditions.values()))
 
     def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
         for condition in self.conditions.values():
@@ -86,7 +88,10 @@ class HeadContent(Content):
 
     def twins(self, file: RecordingFile) -> dict[str, list[int]]:
         joints = joint_twins(file.part("motion").skeleton)
-        return {"R_parent_joint": joints, "t_parent_joint": joints, "foot_contact": [1, 0]}
+        own = {"R_parent_joint": joints, "t_parent_joint": joints, "foot_contact": [1, 0]}
+        for each in self.conditions.values():
+            own |= each.twins
+        return own
 
     def track(self, store: RecordingStore, name: str, recording: Recording, every: int) -> Track:
         head, motion = recording.head, recording.motion
@@ -96,7 +101,7 @@ class HeadContent(Content):
         stature, T_world_head = motion.skeleton.height_of("head"), head.T_world_head
         from_path = floor_from_path(head.timestamps, T_world_head.t, stature)
         from_points = floor_from_points(recording.points, T_world_head.t, stature)
-        conditions = {key: condition.frames(store, name) for key, condition in self.conditions.items()}
+        own = [condition.track(key, store, recording, name) for key, condition in self.conditions.items()]
         values = {
             "R_parent_joint": motion.R_parent_joint,
             "R_world_head": T_world_head.R,
@@ -104,10 +109,11 @@ class HeadContent(Content):
             "floor_height": from_path if from_points is None else from_points,
             "floor_from_head": from_path,
             "foot_contact": true_foot_contact(recording),
-            **{key: row for key, (_, row) in conditions.items()},
         }
         constants = {"t_parent_joint": bones_in_parts(motion.skeleton), "size": size_in_parts(motion.skeleton)}
-        return Track(values, constants, {key: table for key, (table, _) in conditions.items()})
+        for each in own:
+            values |= each.values
+        return Track(values, constants, {name: table for each in own for name, table in each.tables.items()})
 
     def batch(self, batch: Batch) -> HeadWindow:
         """Raises WearcapError where a condition was scaled that does not follow."""
@@ -116,20 +122,17 @@ class HeadContent(Content):
             fix = f"Leave out transforms.scale, or {', '.join(metric)} (surroundings=head)."
             raise WearcapError(f"codes of {metric[0]} cannot be scaled", fix=fix)
         values, draws = dict(batch.values), batch.draws
-        rows = [values.pop(name) for name in self.conditions]
-        side = torch.zeros_like(batch.track) if batch.mirrored is None else batch.mirrored.long()
-        found = [batch.packed.tables[name][row, side[:, None]].float() for name, row in zip(self.conditions, rows)]
+        found = [condition.read(name, batch, values) for name, condition in self.conditions.items()]
         none = torch.zeros(*batch.valid.shape, 0, device=batch.device)
-        given = torch.stack([row >= 0 for row in rows], -1) if rows else none.bool()
-        if batch.others is not None:  # what surrounds the wearer does not belong to another body
-            given = given & ~batch.others[:, None, None]
+        given = torch.stack([shown for _, shown in found], -1) if found else none.bool()
+        if batch.others is not None:
             others = batch.others[:, None]
             values["floor_height"] = torch.where(others, values["floor_from_head"], values["floor_height"])
         values["foot_contact"] = values["foot_contact"].float()
         return HeadWindow(
             **values,
             valid=batch.valid,
-            others=torch.cat([none, *found], -1),
+            others=torch.cat([none, *(features for features, _ in found)], -1),
             given=given,
             noise=draws.normal("noise", batch.count, 6 * values["R_parent_joint"].shape[2] + FEET),
             level=draws.uniform("level", 1),
