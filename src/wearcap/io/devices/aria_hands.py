@@ -1,9 +1,9 @@
 """Hands that Aria's machine perception services (MPS) track, as poses of the skeleton's wrists.
 
 MPS gives places of a wrist and a palm's centre in its device frame `aria`, and normals of both, or 21 landmarks. In the
-sample of projectaria_tools the normals of both sides point out of the palm: as fingers curl, their tips move along them
-(by up to 7 cm), and the thumb lies on the side where it then must. The wrist's normal is an axis of MPS' own wrist frame
-(documented: its -y), whose axes z, x, y are x, y, z here.
+sample's `hand_tracking_results_v2.csv` (projectaria_tools) the normals of both sides point out of the palm: as fingers curl,
+their tips move along them (by up to 7 cm), and the thumb lies on the side where it then must. The wrist's normal is -y of
+MPS' own wrist frame, whose axes z, x, y are x, y, z here, up to 3° with normals and 10° with landmarks alone.
 """
 
 from collections.abc import Sequence
@@ -52,15 +52,16 @@ def _wrists(path: Path, head: Trajectory, landmarks: bool, normals: bool) -> dic
     parts += ["n{}_{}_wrist_device"] if normals else [f"t{{}}_{{}}_{name}_device" for name in (_INDEX, _PINKY)]
     columns = {side: [[part.format(axis, side) for part in parts] for axis in "xyz"] for side in ("left", "right")}
     scores = {side: f"{side}_tracking_confidence" for side in columns}
-    table = read_columns(path, [_TIME, *scores.values(), *np.ravel(list(columns.values()))])
+    names = [name for axes in columns.values() for axis in axes for name in axis]
+    table = read_columns(path, [_TIME, *scores.values(), *names])
     check_finite({name: table[name] for name in (_TIME, *scores.values())}, path)
     check_rising(table[_TIME] * 1e-6, path)
     wrists = {}
-    for side, names in columns.items():
+    for side, axes in columns.items():
         rows = np.flatnonzero(table[scores[side]] >= MIN_CONFIDENCE)
         if not len(rows):
             continue
-        points = np.stack([[table[name][rows] for name in axis] for axis in names]).T  # (row, part, axis)
+        points = np.stack([[table[name][rows] for name in axis] for axis in axes]).T  # (row, part, axis)
         check_finite({f"{side} hand": points}, path, lambda k, rows=rows: row_name(int(rows[k])))
         wrist, palm, *rest = torch.from_numpy(points).unbind(1)
         left = 1.0 if side == "left" else -1.0
