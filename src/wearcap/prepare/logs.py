@@ -154,9 +154,8 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     """The head's path, points and camera of one trajectory."""
     if file.is_dir() and is_mps_folder(file):
         read = read_mps(file)
-        return replace(
-            read, name=name, skeleton=settings.skeleton(), note="Aria's MPS folder: nominal glasses", **about
-        )
+        note = "; ".join(["Aria's MPS folder: nominal glasses", *filter(None, [read.note])])
+        return replace(read, name=name, skeleton=settings.skeleton(), note=note, **about)
     unit, fps = settings.time_unit, settings.fps
     read = read_trajectory_file(file, unit, None if fps is None else float(fps))
     head, alignment, note = head_of(read, settings, str(file))

@@ -80,6 +80,8 @@ def load_mps(folder: Path) -> Loaded:
         findings.append(check.ok("MPS trusts its poses", evidence))
     findings.append(Check("closed-loop file: gravity").ok("points along -z", "9.81 m/s²"))
     recording = read_mps(folder)
+    if recording.note:
+        findings.append(Check("hands").note("none is used", recording.note))
     check, path = Check("MPS summary"), find_mps_file(folder, ("summary.json",))
     if path is None:
         return Loaded(recording, findings)

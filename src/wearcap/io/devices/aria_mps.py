@@ -1,4 +1,4 @@
-"""Project Aria's machine perception services (MPS): head trajectory and semi-dense points from CSV files.
+"""Project Aria's machine perception services (MPS): head trajectory, hands and semi-dense points from CSV files.
 
 Frames: `aria` is MPS's own device frame (on Gen 1 glasses the left SLAM camera), `cpf` the central pupil frame
 (x left, y up, z forward, midway between the pupils), `device` that same point with wearcap's head axes
@@ -16,6 +16,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.io.devices.aria_hands import read_hands
 from wearcap.io.devices.axes import WORLDS
 from wearcap.io.formats.csv_table import iter_columns, read_columns, read_header
 from wearcap.io.formats.poses import check_finite, checked_trajectory
@@ -35,6 +36,11 @@ _SUFFIXES = ("", ".gz", ".xz")
 _TRAJECTORY = ("closed_loop_trajectory.csv",)
 _POINTS = ("semidense_points.csv", "global_points.csv")
 _OBSERVATIONS = ("semidense_observations.csv",)
+_HAND_FOLDERS = ("", "hand_tracking/", "mps/hand_tracking/")
+_HANDS = tuple(
+    tuple(f"{part}{name}{version}.csv" for part in _HAND_FOLDERS for version in ("", "_v3", "_v2", "_v1"))
+    for name in ("wrist_and_palm_poses", "hand_tracking_results")
+)
 _SUBFOLDERS = (".", "slam", "trajectory", "mps/slam", "mps/trajectory")
 
 
@@ -168,7 +174,7 @@ def is_mps_folder(folder: str | Path) -> bool:
 
 
 def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid | None = None) -> Recording:
-    """Recording of an MPS output folder: head stream at `fps` (Hz) and, where there are any, points.
+    """Recording of an MPS output folder: head stream at `fps` (Hz) and, where there are any, points and tracked wrists.
 
     Raises WearcapError when there is no closed-loop trajectory, or a file is not as documented.
     """
@@ -176,8 +182,11 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
     if path is None:
         what = "no closed_loop_trajectory.csv (plain, .gz or .xz)"
         raise WearcapError(what, folder, "the output folder of Aria's MPS")
-    head = head_stream(read_closed_loop(path)[0], fps=fps, T_aria_cpf=T_aria_cpf, where=path)
-    return Recording(name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS")
+    track = read_closed_loop(path).trajectory
+    head = head_stream(track, fps=fps, T_aria_cpf=T_aria_cpf, where=path)
+    wrists, note = read_hands(_found(folder, *_HANDS), track)
+    name, points = Path(folder).resolve().name, read_mps_points(folder)
+    return Recording(name=name, head=head, points=points, tracked=wrists, source="Aria MPS", note=note)
 
 
 def read_mps_points(folder: str | Path) -> PointCloud | None:
@@ -190,5 +199,8 @@ def read_mps_points(folder: str | Path) -> PointCloud | None:
 
 def mps_files(folder: str | Path) -> list[Path]:
     """Files of a folder that `read_mps` reads."""
-    found = (find_mps_file(folder, names) for names in (_TRAJECTORY, _POINTS, _OBSERVATIONS))
-    return [path for path in found if path is not None]
+    return _found(folder, _TRAJECTORY, _POINTS, _OBSERVATIONS, *_HANDS)
+
+
+def _found(folder: str | Path, *kinds: tuple[str, ...]) -> list[Path]:
+    return [path for names in kinds if (path := find_mps_file(folder, names)) is not None]
