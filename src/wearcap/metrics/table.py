@@ -20,6 +20,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rigid import Rigid
 from wearcap.metrics import gait, physics, position
+from wearcap.metrics.certainty import certainty_scores
 from wearcap.recording.motion import Motion
 
 MAX_DECIMALS = 6
@@ -113,7 +114,8 @@ def evaluate_motion(
         **plausible,
         **{f"{TRUTH}{name}": value for name, value in plausible_true.items()},
     }
-    return {name: float(value) for name, value in scores.items()} | both_walking(prediction, truth)
+    found = {name: float(value) for name, value in scores.items()}
+    return found | both_walking(prediction, truth) | certainty_scores(prediction, truth)
 
 
 def both_walking(prediction: Motion, truth: Motion) -> dict[str, float]:

@@ -57,9 +57,9 @@ class Interactions:
         return (within[..., None] & self.hands).any(1)
 
 
-PROBABILITIES = ("contact_prob", "hand_contact_prob", "body_contact_prob")
+ESTIMATES = ("contact_prob", "hand_contact_prob", "body_contact_prob", "joint_std")
 """Optional fields of a Motion with a row per frame."""
-PER_FRAME = ("timestamps", "R_parent_joint", "t_world_root", *PROBABILITIES)
+PER_FRAME = ("timestamps", "R_parent_joint", "t_world_root", *ESTIMATES)
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,8 @@ class Motion:
     interactions: Interactions | None = None
     provenance: dict[str, str] = field(default_factory=dict)
     """Pipeline, checkpoint and config hash, or the source of a ground truth."""
+    joint_std: Float[Tensor, "time joint"] | None = None
+    """Standard deviation (m) along each axis of every joint's position, as the system expects it."""
 
     def __len__(self) -> int:
         return len(self.timestamps)

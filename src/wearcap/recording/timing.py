@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.geometry.trajectory import Trajectory, interpolate, slerp
-from wearcap.recording.motion import PER_FRAME, PROBABILITIES, Interactions, Motion
+from wearcap.recording.motion import ESTIMATES, PER_FRAME, Interactions, Motion
 from wearcap.recording.recording import Recording
 
 _POSES = ("timestamps", "R_world_body", "t_world_body")
@@ -72,7 +72,7 @@ def joined(parts: Sequence[Motion]) -> Motion | None:
 
 
 def _probabilities(motion: Motion, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
-    there = {name: getattr(motion, name) for name in PROBABILITIES}
+    there = {name: getattr(motion, name) for name in ESTIMATES}
     return {name: change(prob) for name, prob in there.items() if prob is not None}
 
 

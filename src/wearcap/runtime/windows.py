@@ -90,6 +90,8 @@ class FinalPoses(NamedTuple):
     R_parent_joint: Float[Tensor, "time joint 3 3"]
     t_world_root: Float[Tensor, "time 3"]
     contact_prob: Float[Tensor, "time foot"]
+    joint_std: Float[Tensor, "time deviation"]
+    """As of a `Motion`; no columns of systems that do not say how sure they are."""
 
     @property
     def T_world_head(self) -> Rigid:
@@ -104,8 +106,9 @@ class FinalPoses(NamedTuple):
     def motion(self, skeleton: Skeleton, provenance: dict[str, str], contacts: bool = True) -> Motion:
         """The poses as a motion; `contacts`: whether contacts were predicted, of both patches of a foot alike."""
         contact_prob = self.contact_prob.repeat_interleave(2, -1) if contacts else None
-        poses = self.R_parent_joint, self.t_world_root, contact_prob
-        return Motion(self.timestamps, skeleton, *poses, provenance=provenance)
+        poses, joint_std = (self.R_parent_joint, self.t_world_root, contact_prob), self.joint_std
+        known = joint_std if joint_std.shape[1] else None
+        return Motion(self.timestamps, skeleton, *poses, joint_std=known, provenance=provenance)
 
 
 class StretchWindows(Window[Frames], ABC):
@@ -119,8 +122,8 @@ class StretchWindows(Window[Frames], ABC):
         self._final: list[FinalPoses] = []
 
     @abstractmethod
-    def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor]:
-        """Predicted rotations, root and contacts of some of the window's frames, as in `FinalPoses`."""
+    def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Predicted rotations, root, contacts and deviations of some of the window's frames, as in `FinalPoses`."""
 
     def emit(self, lookahead: int) -> None:
         """Put out the frames that are final from now on: all but the last `lookahead`."""

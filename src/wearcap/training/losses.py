@@ -67,6 +67,17 @@ def balanced_cross_entropy(
     return masked_mean(error.mean(-1), weight)
 
 
+def surprise(
+    error: Float[Tensor, "batch time joint 3"],
+    std: Float[Tensor, "batch time joint"],
+    weight: Float[Tensor, "batch time"],
+) -> Float[Tensor, ""]:
+    """Mean negative log likelihood of errors (m) of joints under normal distributions alike along all axes, without its
+    constant; errors below a millimetre count as one."""
+    square = error.square().mean(-1) + EPSILON_M2
+    return masked_mean((std.log() + square / (2 * std.square())).mean(-1), weight)
+
+
 def foot_skate(
     feet: Float[Tensor, "batch time foot point 3"],
     contact: Float[Tensor, "batch time foot"],

@@ -5,11 +5,16 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from wearcap.body.skeleton import FEET
 from wearcap.data.features import LIMBS, first_repeated
 from wearcap.errors import require_choice
 from wearcap.geometry import rotation
+
+SPREAD_M = 0.05
+"""Deviation (m) whose logarithm counts as 0."""
+_LOGARITHMS = -5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,8 @@ class HeadFeatures:
     joints: int = 23
     contacts: bool = False
     """Whether the motion vector includes both feet's contacts as ±1 (as in EDGE; ours)."""
+    spread: bool = False
+    """Whether the motion vector includes the logarithm of every joint's standard deviation (ours)."""
     body: bool = False
     """Whether the condition includes the wearer's body size (ours): stature, length of leg, arm and trunk (m)."""
 
@@ -40,8 +47,13 @@ class HeadFeatures:
         return (13 if self.frame == "heading" else 15) + (len(LIMBS) if self.body else 0)
 
     @property
-    def motion_size(self) -> int:
+    def pose_size(self) -> int:
+        """Values of the motion vector that are diffused: all but the deviations."""
         return 6 * self.joints + (FEET if self.contacts else 0)
+
+    @property
+    def motion_size(self) -> int:
+        return self.pose_size + (self.joints if self.spread else 0)
 
     def frame_of(self, R_world_head: Float[Tensor, "batch time 3 3"]) -> Float[Tensor, "batch #time 3 3"]:
         """R_world_canonical of every frame, or one for all frames when `frame` is "window"."""
@@ -83,11 +95,13 @@ class HeadFeatures:
         R_world_head: Float[Tensor, "batch time 3 3"],
         foot_contact: Float[Tensor, "batch time foot"],
     ) -> Float[Tensor, "batch time motion"]:
-        """Local rotations as 6D, the root's in the canonical frame (thesis: F = 23 × 6); contacts if `contacts`."""
+        """Local rotations as 6D, the root's in the canonical frame (thesis: F = 23 × 6); contacts if `contacts`; zeros in the
+        places of deviations, which no motion has."""
         R_root = self.frame_of(R_world_head).transpose(-1, -2) @ R_parent_joint[:, :, 0]
         R = torch.cat([R_root[:, :, None], R_parent_joint[:, :, 1:]], 2)
         motion = rotation.rot6d_from_matrix(R).flatten(-2)
-        return torch.cat([motion, 2 * foot_contact - 1], -1) if self.contacts else motion
+        motion = torch.cat([motion, 2 * foot_contact - 1], -1) if self.contacts else motion
+        return F.pad(motion, (0, self.motion_size - self.pose_size))
 
     def decode(
         self, motion: Float[Tensor, "batch time motion"], R_world_head: Float[Tensor, "batch time 3 3"]
@@ -96,6 +110,12 @@ class HeadFeatures:
         R = rotation.matrix_from_rot6d(motion[..., : 6 * self.joints].unflatten(-1, (-1, 6)))
         R_root = self.frame_of(R_world_head) @ R[:, :, 0]
         contact = (
-            (motion[..., 6 * self.joints :] + 1) / 2 if self.contacts else motion.new_zeros(*motion.shape[:2], FEET)
+            (motion[..., 6 * self.joints : self.pose_size] + 1) / 2
+            if self.contacts
+            else motion.new_zeros(*motion.shape[:2], FEET)
         )
         return torch.cat([R_root[:, :, None], R[:, :, 1:]], 2), contact.clamp(0, 1)
+
+    def joint_std(self, motion: Float[Tensor, "batch time motion"]) -> Float[Tensor, "batch time deviation"]:
+        """Standard deviation (m) along each axis of every joint's position relative to the head; none without `spread`."""
+        return SPREAD_M * motion[..., self.pose_size :].clamp(*_LOGARITHMS).exp()

@@ -245,9 +245,10 @@ class HMD2(LearnedSystem):
         )
         x0 = blended(x0, observed, is_observed_on_device, self.overlap.fade)
         motion = net.motion_normalizer.inverse(x0.float()).cpu()
+        found = *features.decode(motion, frames.R_world_head), features.joint_std(motion)
         poses = [
             torch.where(is_observed.reshape(*is_observed.shape, *[1] * (old.ndim - 2)), old, new)
-            for old, new in zip(predicted[:2], features.decode(motion, frames.R_world_head))
+            for old, new in zip(predicted[:3], found)
         ]
         for item, sampler in enumerate(samplers):
             mine = (part[item : item + 1, : sampler.count] for part in (*poses, predicted.noise))

@@ -6,7 +6,9 @@ from typing import Any
 
 import torch
 from einops import rearrange
+from lightning.pytorch import Callback, Trainer
 from torch import Tensor
+from torch.nn import functional as F
 
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.windows import MIN_SCALE, Windows, drawn_batches
@@ -61,8 +63,8 @@ class Loss:
 class MotionDiffusion(Training):
     """x0-prediction under one noise level per window.
 
-    Terms of the loss: "motion" is the thesis's plain MSE; "joints", "velocity", "skate" and "contact" (cross entropy) are
-    ours (0 leaves them out). Conditions beside the head's path are dropped at random (`Condition.drop`).
+    Terms of the loss: "motion" is the thesis's plain MSE; "joints", "velocity", "skate", "contact" (cross entropy) and
+    "spread" (of the joints' deviations, whose errors teach nothing else) are ours (0 leaves them out). Conditions beside the head's path are dropped at random (`Condition.drop`).
     """
 
     system = HMD2
@@ -117,6 +119,8 @@ class MotionDiffusion(Training):
             elif condition.encoder != made_by:
                 raise WearcapError(f"{name} of {made_by!r}", expected=condition.encoder)
         statistics = feature_statistics(dataset, self.features, net.conditions, limit)
+        for value, part in zip((0.0, 1.0), statistics["motion"]):
+            part[self.features.pose_size :] = value
         net.motion_normalizer.set(*statistics["motion"])
         net.condition_encoder.normalizer.set(*statistics["head"])
         for name in net.conditions:
@@ -139,7 +143,9 @@ class MotionDiffusion(Training):
             conditions = self.conditions(batch)
         encoded = self.net.encode(conditions, batch.valid)
         level = self.levels.of(batch.level)
-        x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
+        noise = batch.noise[..., : self.features.pose_size]
+        noise = F.pad(noise, (0, x0.shape[-1] - noise.shape[-1]))
+        x_t = add_noise(x0, noise, level, self.schedule)
         if not self.net.self_conditioning:
             return self.net(x_t, level, encoded, batch.valid)
         with torch.no_grad():
@@ -151,6 +157,7 @@ class MotionDiffusion(Training):
         with losses.exact(batch.t_world_head):
             motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
             x0 = self.net.motion_normalizer(motion)
+            x0[..., self.features.pose_size :] = 0.0
         x0_hat = self._predicted(batch, x0)
         with losses.exact(x0):
             return self._errors(x0_hat.float(), x0, batch)
@@ -159,7 +166,8 @@ class MotionDiffusion(Training):
         valid = batch.valid  # padding weighs nothing
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
         weight = valid * (1 + self.loss.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
-        terms = {"motion": losses.motion_mse(x0_hat, x0, weight)}
+        pose = slice(self.features.pose_size)
+        terms = {"motion": losses.motion_mse(x0_hat[..., pose], x0[..., pose], weight)}
         if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate", "contact")):
             motion_hat = self.net.motion_normalizer.inverse(x0_hat)
             R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
@@ -167,6 +175,9 @@ class MotionDiffusion(Training):
             predicted, true = (batch.joints_from_head(self.skeleton, R) for R in (R_hat, batch.R_parent_joint))
             terms["joints"] = losses.joint_position(predicted, true, weight)
             terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.fps)
+            if self.features.spread:
+                spread = self.features.joint_std(x0_hat)
+                terms["spread"] = losses.surprise(predicted.detach() - true, spread, weight)
             feet = predicted[:, :, self._feet]
             feet = rearrange(feet, "batch time (foot point) xyz -> batch time foot point xyz", foot=FEET)
             feet = feet + batch.t_world_head[:, :, None, None]
@@ -177,6 +188,33 @@ class MotionDiffusion(Training):
                     logit, batch.foot_contact, self.loss.contact_share, weight
                 )
         return terms
+
+
+class FitSpread(Callback):
+    """Scales the joints' deviations after every validation epoch, so that 68 % of the errors of one step from noise are within
+    them; the checkpoint stores the factors as the mean of the deviations' logarithms.
+
+    It must come before the weight averaging in the list of callbacks: the factors belong to the averaged weights.
+    """
+
+    @torch.no_grad()
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: MotionDiffusion) -> None:
+        features, net = pl_module.features, pl_module.net
+        loader = trainer.val_dataloaders
+        if not features.spread or loader is None:
+            return
+        shares = []
+        for batch in loader:
+            batch = pl_module.transfer_batch_to_device(batch, pl_module.device, 0)
+            batch = batch._replace(level=torch.ones_like(batch.level))
+            motion = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+            x0_hat = pl_module._predicted(batch, net.motion_normalizer(motion)).float()
+            R_hat, _ = features.decode(net.motion_normalizer.inverse(x0_hat), batch.R_world_head)
+            found, true = (batch.joints_from_head(pl_module.skeleton, R) for R in (R_hat, batch.R_parent_joint))
+            away = (found - true).abs() / features.joint_std(x0_hat)[..., None]
+            shares.append(away[batch.valid].movedim(1, 0).flatten(1))
+        factor = torch.cat(shares, 1).quantile(0.6827, dim=1)
+        net.motion_normalizer.mean[features.pose_size :] = factor.clamp_min(0.1).log()
 
 
 def feature_statistics(

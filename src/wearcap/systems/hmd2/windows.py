@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
+from torch.nn import functional as F
 
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.features import body_size
@@ -55,6 +56,7 @@ class Predicted(NamedTuple):
 
     R_parent_joint: Float[Tensor, "batch time joint 3 3"]
     foot_contact: Float[Tensor, "batch time foot"]
+    joint_std: Float[Tensor, "batch time deviation"]
     noise: Float[Tensor, "batch time step feature"]
     """Noise of every sampling step."""
 
@@ -69,8 +71,13 @@ class WindowSampler(StretchWindows[Frames]):
         """`length`: most frames of a window; `steps`: denoising steps, each with noise of its own."""
         super().__init__(length)
         self.size = body_size(skeleton)
-        self._random, self._sizes = torch.Generator().manual_seed(seed), (steps, features.motion_size)
-        self._rest = torch.eye(3).expand(1, 1, features.joints, 3, 3), torch.zeros(1, 1, FEET)
+        deviations = features.motion_size - features.pose_size
+        self._random, self._sizes = torch.Generator().manual_seed(seed), (steps, features.pose_size)
+        self._rest = (
+            torch.eye(3).expand(1, 1, features.joints, 3, 3),
+            torch.zeros(1, 1, FEET),
+            torch.zeros(1, 1, deviations),
+        )
         self.predicted = self._unpredicted(0)
         self.waiting: Frames | None = None
         """Frames that no window contains yet."""
@@ -89,8 +96,9 @@ class WindowSampler(StretchWindows[Frames]):
         self.predicted = appended(self.predicted, self._unpredicted(stride), dropped)
 
     def _unpredicted(self, count: int) -> Predicted:
-        """New frames: identity rotations, no contact, and noise of their own."""
+        """New frames: identity rotations, no contact, and noise of their own, but for deviations, which are not diffused."""
         noise = torch.randn(1, count, *self._sizes, generator=self._random)
+        noise = F.pad(noise, (0, self._rest[2].shape[-1]))
         return Predicted(*(part.repeat(1, count, *[1] * (part.ndim - 2)) for part in self._rest), noise)
 
     def finalize(self, lookahead: int) -> slice:
@@ -98,9 +106,9 @@ class WindowSampler(StretchWindows[Frames]):
         # Frames after a recording's end are not valid and never output.
         return super().finalize(lookahead + int((~self.frames.valid).sum()))
 
-    def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor]:
+    def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         R = self.predicted.R_parent_joint[0, part]
-        return R, torch.zeros(len(R), 3), self.predicted.foot_contact[0, part]
+        return R, torch.zeros(len(R), 3), self.predicted.foot_contact[0, part], self.predicted.joint_std[0, part]
 
 
 def blended(

@@ -122,9 +122,9 @@ class EstimatorWindows(StretchWindows[Frames]):
         assert self.frames is not None
         return self.frames.floor_height[0, -1].item()
 
-    def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor]:
+    def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         rows = self._sum[0, part]
-        return _parts(rows[:, :-1] / rows[:, -1:])
+        return *_parts(rows[:, :-1] / rows[:, -1:]), rows[:, :0]
 
 
 def _parts(
