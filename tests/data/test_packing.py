@@ -68,7 +68,7 @@ def test_rows_that_compiled_loops_would_read_beyond_are_refused(track):
 def test_a_track_is_the_same_from_its_file(tmp_path):
     R = rotation.exp(torch.randn(6, 3))
     track = Track({"R_world_head": R, "object": torch.arange(6).int()}, {"size": R[0]}, {"object": R})
-    made = [kept_track(tmp_path, "key", "a", lambda: track) for _ in range(2)]
+    made = [kept_track(tmp_path / "a.safetensors", lambda: track) for _ in range(2)]
     assert made[0].flat().keys() == made[1].flat().keys()
     assert all(torch.equal(value, made[1].flat()[name]) for name, value in made[0].flat().items())
 

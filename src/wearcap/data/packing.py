@@ -1,27 +1,40 @@
 """Recordings packed for training: all values of a kind in one tensor, the recordings' rows one after another.
 
 Rotations are quaternions of 16-bit numbers (off by less than 0.004 degrees). What a recording becomes is kept in a file
-of the data set's cache, so that the next training starts at once.
+of the data set's cache, so that a data set that grew, or was packed in part, is not packed anew. What they all become is
+kept there once more, in files that the next training maps to memory: it starts at once, and reads what it draws.
 """
 
+import json
+import math
 import os
 import shutil
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TypeVar
 
 import torch
 from jaxtyping import Float, Int16, Int64
 from torch import Tensor
 
+from wearcap.boundary.opening import path_inside, understood
 from wearcap.boundary.tensors import read_tensors, write_tensors
+from wearcap.boundary.texts import read_json, require_layout
 from wearcap.errors import WearcapError
+from wearcap.files import atomic_path, write_text
 from wearcap.geometry import rotation
 
 KEPT = 4
-"""Number of different packings of a data set, those that were used last, whose files are kept."""
+"""Number of different packings of a data set, those that were used last, whose files are kept; of each, of joined sets."""
+_INDEX = "index.safetensors"
+"""Of a joined set: "length" of each track, and of each other file's rows the kind, "0 row ...", which takes no space."""
+_APART = "a packed recording whose rows do not belong together"
+_KNOWN = "recordings.json"
+_FIX = "Delete the data set's cache/windows-… folders: they are made again."
+_Fact = TypeVar("_Fact")
 _STEP = float(torch.iinfo(torch.int16).max)
 
 
@@ -77,22 +90,42 @@ def _single(value: Tensor) -> Tensor:
 class Packed:
     """Tracks of many recordings, each kind of value in one tensor."""
 
-    def __init__(self, tracks: Sequence[Track], names: Sequence[str]):
+    def __init__(self, tracks: Iterable[Track], names: Sequence[str]):
         """`names` of the recordings, for messages. Raises WearcapError for tracks with other values than the first one."""
-        lengths = torch.tensor([len(next(iter(track.values.values()))) for track in tracks])
-        self.length: Int64[Tensor, "track"] = lengths
-        self.first: Int64[Tensor, "track"] = lengths.cumsum(0) - lengths
-        for track, name in zip(tracks, names):
-            _require_alike(track, tracks[0], name)
-        self.tables = {name: _joined([track.tables[name] for track in tracks], spare=1) for name in tracks[0].tables}
-        self.values = {name: _joined([track.values[name] for track in tracks]) for name in tracks[0].values}
-        self.constants = {
-            name: torch.stack([track.constants[name] for track in tracks]) for name in tracks[0].constants
-        }
-        for name in self.tables:
-            rows = torch.tensor([len(track.tables[name]) for track in tracks])
-            before = (rows.cumsum(0) - rows).repeat_interleave(lengths).to(self.values[name].dtype)
-            self.values[name] += before * (self.values[name] >= 0)  # -1 stays: the last row, of zeros
+        parts: dict[str, list[Tensor]] = {}
+        for rows in _numbered(tracks, names):
+            for key, value in rows.items():
+                parts.setdefault(key, []).append(value)
+        self._take({key: torch.cat(value) for key, value in parts.items()})
+
+    def _take(self, tensors: dict[str, Tensor]) -> None:
+        self.length: Int64[Tensor, "track"] = tensors.pop("length")
+        self.first: Int64[Tensor, "track"] = self.length.cumsum(0) - self.length
+        joined = Track.of(tensors)
+        self.values, self.constants, self.tables = joined.values, joined.constants, joined.tables
+
+    @classmethod
+    def kept(cls, folder: Path, tracks: Callable[[], Iterable[Track]], names: Sequence[str]) -> "Packed":
+        """As of the tracks, mapped from a folder's files, which are made if they are missing.
+
+        Tracks are held in memory only where nothing can be written. Raises WearcapError for damaged files, too.
+        """
+        if not (folder / _INDEX).is_file():
+            try:
+                _write(folder, tracks(), names)
+            except WearcapError:  # a data set that is only read, or a full disk; or what the tracks are refused for
+                return cls(tracks(), names)
+        packed = cls.__new__(cls)
+        packed._take(_mapped(folder, len(names)))
+        return packed
+
+    def twins(self, orders: dict[str, list[int]]) -> dict[str, Int64[Tensor, "place"]]:
+        """What a mirror exchanges, by names of values. Raises WearcapError for what compiled loops would read beyond."""
+        for name, order in orders.items():
+            rotations = len(self.values[name][0, 0]) if is_rotation(name) and name in self.values else len(order)
+            if sorted(order) != list(range(rotations)):
+                raise WearcapError("a mirror that exchanges what is not there", name, f"each of {rotations} once", _FIX)
+        return {name: torch.tensor(order) for name, order in orders.items()}
 
     @property
     def bytes(self) -> int:
@@ -115,8 +148,7 @@ def _require_alike(track: Track, first: Track, name: str) -> None:
         for key in track.tables
     )
     if len(lengths) > 1 or not rows or any(R.dtype != torch.int16 or R.shape[1:-1] != (4,) for R in rotations):
-        fix = "Delete the data set's cache/windows-… folders: they are made again."
-        raise WearcapError("a packed recording whose rows do not belong together", where=name, fix=fix)
+        raise WearcapError(_APART, where=name, fix=_FIX)
     for part in fields(Track):
         found, expected = (_kinds(getattr(each, part.name), part.name) for each in (track, first))
         if found != expected:
@@ -130,19 +162,69 @@ def _kinds(values: dict[str, Tensor], part: str) -> dict[str, tuple]:
     return {key: (value.dtype, *value.shape[0 if part == "constants" else 1 :]) for key, value in values.items()}
 
 
-def _joined(parts: list[Tensor], spare: int = 0) -> Tensor:
-    """Rows of all parts, and further rows of zeros. Parts are let go one after another."""
-    rows = torch.zeros(sum(map(len, parts)) + spare, *parts[0].shape[1:], dtype=parts[0].dtype)
-    place = 0
-    for part in parts:
-        rows[place : place + len(part)] = part
-        place += len(part)
-    return rows
+def _numbered(tracks: Iterable[Track], names: Sequence[str]) -> Iterator[dict[str, Tensor]]:
+    """Rows that tracks add to what is joined, as `Track.flat` and "length", with the tables' rows counted through all tracks.
+
+    Each table ends with a row of zeros, which those who refer to none (-1) refer to. Raises as `_require_alike`.
+    """
+    first, before = None, Counter[str]()
+    for track, name in zip(tracks, names, strict=True):
+        first = first or track
+        _require_alike(track, first, name)
+        values, constants = dict(track.values), {key: value[None] for key, value in track.constants.items()}
+        for key, table in track.tables.items():
+            values[key] = torch.where(values[key] >= 0, values[key] + before[key], values[key])
+            before[key] += len(table)
+        length = torch.tensor([len(next(iter(values.values())))])
+        yield Track(values, constants, track.tables).flat() | {"length": length}
+    if first is not None:
+        yield {f"tables.{key}": table.new_zeros(1, *table.shape[1:]) for key, table in first.tables.items()}
 
 
-def kept_track(root: Path, key: str, name: str, make: Callable[[], Track]) -> Track:
-    """The track of a recording from the cache of its data set, made if it is missing; damaged files are made anew."""
-    path = root / "cache" / f"windows-{key}" / f"{name}.safetensors"
+def _write(folder: Path, tracks: Iterable[Track], names: Sequence[str]) -> None:
+    """Write what tracks become, part by part; the index last."""
+    lengths, counts, kinds = list[Tensor](), Counter[str](), dict[str, Tensor]()
+    with ExitStack() as stack:
+        files: dict[str, BinaryIO] = {}
+        for rows in _numbered(tracks, names):
+            lengths += [rows.pop("length")] if "length" in rows else []
+            for key, value in rows.items():
+                if key not in files:
+                    path = stack.enter_context(atomic_path(folder / key))
+                    files[key], kinds[key] = stack.enter_context(open(path, "wb")), value[:0]
+                files[key].write(value.reshape(-1).view(torch.uint8).numpy())
+                counts[key] += len(value)
+    index = {key: kind.new_empty(0, counts[key], *kind.shape[1:]) for key, kind in kinds.items()}
+    write_tensors(folder / _INDEX, index | {"length": torch.cat(lengths)})
+
+
+def _mapped(folder: Path, count: int) -> dict[str, Tensor]:
+    """What was written of `count` tracks, not read yet. Raises WearcapError where compiled loops would read beyond it."""
+    index = read_tensors(folder / _INDEX, "packed data set", _FIX)[1]
+    with understood(_APART, folder, fix=_FIX, errors=(OSError, LookupError, RuntimeError, TypeError, ValueError)):
+        lengths, found = index.pop("length").long(), dict[str, Tensor]()
+        frames = sum(lengths.tolist())
+        for key, kind in index.items():
+            path, shape = path_inside(folder, key, folder), kind.shape[1:]
+            part, name = key.split(".")
+            rows = {"values": frames, "constants": count, "tables": shape[0]}[part]
+            size = math.prod(shape)
+            if shape[0] != rows or path.stat().st_size != size * kind.itemsize:
+                raise ValueError(f"{key} is not of {rows} rows")
+            if part == "values" and is_rotation(name) and (kind.dtype != torch.int16 or shape[1:-1] != (4,)):
+                raise ValueError(f"{key} is no rotation")
+            found[key] = torch.from_file(str(path), shared=False, size=size, dtype=kind.dtype).reshape(shape)
+        for key, table in Track.of(found).tables.items():
+            rows = found[f"values.{key}"]
+            if not (int(rows.min()) >= -1 and int(rows.max()) < len(table) - 1):
+                raise ValueError(f"{key} has no such row")
+        if lengths.shape != (count,) or int(lengths.min()) < 1:
+            raise ValueError(f"it is not of {count} recordings")
+    return found | {"length": lengths}
+
+
+def kept_track(path: Path, make: Callable[[], Track]) -> Track:
+    """The track of a recording from a file of its data set's cache, made if it is missing; damaged ones are made anew."""
     if path.is_file():
         try:
             return Track.of(read_tensors(path, "packed recording")[1])
@@ -154,13 +236,44 @@ def kept_track(root: Path, key: str, name: str, make: Callable[[], Track]) -> Tr
     return track
 
 
-def forget_old(root: Path, key: str) -> None:
-    """Remove the files of all but `KEPT` packings of a data set: the one of a key, and those that were used last."""
-    with suppress(OSError):  # a data set that is only read
-        os.utime(root / "cache" / f"windows-{key}")
-    folders = sorted((root / "cache").glob("windows-*"), key=lambda folder: folder.stat().st_mtime, reverse=True)
-    for folder in folders[KEPT:]:
-        shutil.rmtree(folder, ignore_errors=True)
+def forget_old(used: Path) -> None:
+    """Remove all but `KEPT` folders of a kind ("windows-…"): the one in use, and those beside it that were used last."""
+    with suppress(OSError):  # a data set that is only read, or another process that removes them
+        os.utime(used)
+        kind = used.name.split("-")[0]
+        folders = sorted(used.parent.glob(f"{kind}-*"), key=lambda folder: folder.stat().st_mtime, reverse=True)
+        for folder in folders[KEPT:]:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@dataclass
+class Known:
+    """What is known of a data set's recordings without their frames, by their checksums."""
+
+    usable: dict[str, bool] = field(default_factory=dict)
+    handled: dict[str, bool] = field(default_factory=dict)
+    """Whether objects are handled."""
+    twins: dict[str, dict[str, list[int]]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, folder: Path) -> "Known":
+        """As a folder of the cache has it; nothing where its file is missing or damaged."""
+        with suppress(WearcapError):
+            return require_layout(read_json(folder / _KNOWN), cls, folder)
+        return cls()
+
+    def keep(self, folder: Path) -> None:
+        """Write what the folder does not have."""
+        if self != Known.of(folder):
+            with suppress(WearcapError):  # a data set that is only read
+                write_text(folder / _KNOWN, json.dumps(asdict(self)))
+
+
+def once(facts: dict[str, _Fact], recording: str, find: Callable[[], _Fact]) -> _Fact:
+    """A fact of a recording, found if it is not known."""
+    if recording not in facts:
+        facts[recording] = find()
+    return facts[recording]
 
 
 def require_rows(values: dict[str, Any], where: str | Path) -> None:

@@ -7,7 +7,7 @@ split are computed of windows drawn from it, and saved with the weights.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,7 +20,7 @@ from wearcap.data.arm_mixing import ArmDonors
 from wearcap.data.batch import Batch, Transform
 from wearcap.data.bodies import OtherBodies
 from wearcap.data.draws import Draws
-from wearcap.data.packing import Packed, Track, forget_old, kept_track
+from wearcap.data.packing import Known, Packed, Track, forget_old, kept_track, once
 from wearcap.data.transforms import Cutting, TimeStretch
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
@@ -124,6 +124,8 @@ class Windows:
         stretch = max((each.factor for each in chosen if isinstance(each, TimeStretch)), default=1.0)
         stores = [RecordingStore.open(source.root) for source in sources]
         content.prepare(stores, split)
+        key = _key(content)
+        known = {store.root: Known.of(_folder(store, key)) for store in stores}
         least, rows, found = content.min_frames(window, stretch), [], list[_Chosen]()
         for source, store in zip(sources, stores):
             rate, entries = _rows(store, split, fps, every)
@@ -132,11 +134,14 @@ class Windows:
             power = balance if split == "train" else 1.0
             total = sum(count**power for count in counts)
             for (name, _), count in zip(entries, counts):
-                if content.usable(store, name):
+                sha256, facts = store.entries[name].sha256, known[store.root]
+                if once(facts.usable, sha256, partial(content.usable, store, name)):
                     step = 1 if content.own_rate else rate
                     rows += [(len(found), k * stride * step, step) for k in range(count)]
                     weight = source.weight * count ** (power - 1) / total
-                    found.append(_Chosen(store, name, rate, source.bodies, count, weight))
+                    varied = self.bodies is not None and source.bodies
+                    varied = varied and not once(facts.handled, sha256, partial(_handled, store, name))
+                    found.append(_Chosen(store, name, rate, varied, count, weight))
         if not rows:
             what = f"no windows in split {split!r}"
             expected = f"recordings of at least {least} frames{content.requires}"
@@ -145,28 +150,35 @@ class Windows:
             raise WearcapError(f"recordings of {sorted(steps)} frames per frame of a window", expected="one rate")
         self.recordings, self.starts, self.step = found, torch.tensor(rows)[:, :2], rows[0][2]
         self.weights = torch.tensor([each.weight for each in found for _ in range(each.count)], dtype=torch.float64)
-        self._pack(found)
+        first = found[0]
+        twins = once(known[first.store.root].twins, first.sha256, lambda: content.twins(first.file))
+        for store in stores:
+            known[store.root].keep(_folder(store, key))
+        self._pack(found, key)
+        self.twins = self.packed.twins(twins)
 
-    def _pack(self, found: Sequence["_Chosen"]) -> None:
+    def _pack(self, found: Sequence["_Chosen"], key: str) -> None:
         """Keep the recordings' tracks, and those of people who move others' arms."""
-        made = [(each, 0) for each in found]
-        varied = [self.bodies is not None and each.bodies and not _handled(each.file) for each in found]
+        made, varied = [(each, 0) for each in found], [each.varied for each in found]
         versions = torch.arange(len(found))[:, None]
         if self.bodies is not None and self.bodies.arms and any(varied):
             versions = versions.repeat(1, ARM_VERSIONS)
             mixed = torch.tensor(varied).nonzero()[:, 0]
             versions[mixed] = len(found) + torch.arange(len(mixed) * ARM_VERSIONS).reshape(-1, ARM_VERSIONS)
             made += [(found[each], version) for each in mixed.tolist() for version in range(1, ARM_VERSIONS + 1)]
-        kept = _Kept(self.content, [each for each, free in zip(found, varied) if free])
-        tracks = [kept(*each) for each in progress(made, "packing recordings", transient=True, disable=len(made) < 8)]
-        for root in {each.store.root for each in found}:
-            forget_old(root, kept.key)
-        if self.bodies is None:
-            tracks = [_of_wearer(track, self.content.parts) for track in tracks]
-        self.packed = Packed(tracks, [each.name for each, _ in made])
+        kept = _Kept(self.content, key, [each for each in found if each.varied])
+
+        def tracks() -> Iterator[Track]:
+            for each in progress(made, "packing recordings", transient=True, disable=len(made) < 8):
+                track = kept(*each)
+                yield _of_wearer(track, self.content.parts) if self.bodies is None else track
+
+        whole = digest([kept.name(*each) for each in made], self.bodies is None)[:24]
+        joined = _folder(found[0].store, key) / f"joined-{whole}"
+        self.packed = Packed.kept(joined, tracks, [each.name for each, _ in made])
+        for used in {joined, *(_folder(each.store, key) for each in found)}:
+            forget_old(used)
         self.varied, self.versions = torch.tensor(varied), versions
-        twins = self.content.twins(found[0].file)
-        self.twins = {name: torch.tensor(order) for name, order in twins.items()}
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -218,9 +230,14 @@ class _Chosen:
     store: RecordingStore
     name: str
     rate: int
-    bodies: bool
+    varied: bool
+    """Whether other people do its motion."""
     count: int
     weight: float
+
+    @property
+    def sha256(self) -> str:
+        return self.store.entries[self.name].sha256
 
     @property
     def file(self) -> RecordingFile:
@@ -230,25 +247,25 @@ class _Chosen:
 class _Kept:
     """Makes the tracks of recordings, or takes them from their data sets' caches."""
 
-    def __init__(self, content: Content, donors: list[_Chosen]):
+    def __init__(self, content: Content, key: str, donors: list[_Chosen]):
         """`donors`: recordings whose arms others may move, in their own data set."""
-        self.content, self.donors = content, donors
-        modules = [each.__module__ for each in type(content).__mro__ if each.__module__.startswith("wearcap.")]
-        self.key = digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
+        self.content, self.key, self.donors = content, key, donors
         self._arms = cache(self._arms_in)
+        self._group = cache(lambda root: digest([each.sha256 for each in donors if each.store.root == root])[:16])
+
+    def name(self, each: _Chosen, version: int) -> str:
+        """Name of a track: what decides, beside the key, what it is."""
+        name = f"{each.sha256[:32]}-{each.rate}"
+        return f"{name}-{version}-{self._group(each.store.root)}" if version else name
 
     def __call__(self, each: _Chosen, version: int) -> Track:
-        entries = each.store.entries
-        name = f"{entries[each.name].sha256[:32]}-{each.rate}"
-        if version:
-            others = [entries[other.name].sha256 for other in self.donors if other.store.root == each.store.root]
-            name += f"-{version}-{digest(others)[:16]}"
-        return kept_track(each.store.root, self.key, name, lambda: self._made(each, version))
+        path = _folder(each.store, self.key) / f"{self.name(each, version)}.safetensors"
+        return kept_track(path, lambda: self._made(each, version))
 
     def _made(self, each: _Chosen, version: int) -> Track:
         recording = each.file.load()
         if version and recording.motion is not None:
-            seed = int(each.store.entries[each.name].sha256[:8], 16) + version
+            seed = int(each.sha256[:8], 16) + version
             mixed = self._arms(each.store.root).mixed(recording.motion, each.file, seed)
             recording = replace(recording, motion=mixed)
         return self.content.track(each.store, each.name, recording, each.rate)
@@ -268,9 +285,20 @@ def _of_wearer(track: Track, parts: frozenset[str]) -> Track:
     return Track(values, constants, track.tables)
 
 
-def _handled(file: RecordingFile) -> bool:
+def _handled(store: RecordingStore, name: str) -> bool:
     """Whether objects are handled in a recording, which other arms would not reach."""
-    return any(key.startswith("object_motion.") for key in file.keys)
+    return any(key.startswith("object_motion.") for key in RecordingFile(store.path_of(name)).keys)
+
+
+def _key(content: Content) -> str:
+    """What decides, beside a recording, what is kept of it."""
+    modules = [each.__module__ for each in type(content).__mro__ if each.__module__.startswith("wearcap.")]
+    return digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
+
+
+def _folder(store: RecordingStore, key: str) -> Path:
+    """Where a data set keeps it."""
+    return store.root / "cache" / f"windows-{key}"
 
 
 def _rows(store: RecordingStore, split: str, fps: float, every: int | None) -> tuple[int, list[tuple[str, int]]]:
