@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 
 import torch
 from jaxtyping import Float, Int16, Int64
@@ -34,7 +34,6 @@ _INDEX = "index.safetensors"
 _APART = "a packed recording whose rows do not belong together"
 _KNOWN = "recordings.json"
 _FIX = "Delete the data set's cache/windows-… folders: they are made again."
-_Fact = TypeVar("_Fact")
 _STEP = float(torch.iinfo(torch.int16).max)
 
 
@@ -203,23 +202,17 @@ def _mapped(folder: Path, count: int) -> dict[str, Tensor]:
     index = read_tensors(folder / _INDEX, "packed data set", _FIX)[1]
     with understood(_APART, folder, fix=_FIX, errors=(OSError, LookupError, RuntimeError, TypeError, ValueError)):
         lengths, found = index.pop("length").long(), dict[str, Tensor]()
-        frames = sum(lengths.tolist())
+        rows = {"values": sum(lengths.tolist()), "constants": count}
         for key, kind in index.items():
             path, shape = path_inside(folder, key, folder), kind.shape[1:]
-            part, name = key.split(".")
-            rows = {"values": frames, "constants": count, "tables": shape[0]}[part]
-            size = math.prod(shape)
-            if shape[0] != rows or path.stat().st_size != size * kind.itemsize:
-                raise ValueError(f"{key} is not of {rows} rows")
-            if part == "values" and is_rotation(name) and (kind.dtype != torch.int16 or shape[1:-1] != (4,)):
-                raise ValueError(f"{key} is no rotation")
+            size, expected = math.prod(shape), rows.get(key.split(".")[0], shape[0])
+            if (shape[0], path.stat().st_size) != (expected, size * kind.itemsize):
+                raise ValueError(f"{key} is not of {expected} rows")
             found[key] = torch.from_file(str(path), shared=False, size=size, dtype=kind.dtype).reshape(shape)
-        for key, table in Track.of(found).tables.items():
-            rows = found[f"values.{key}"]
-            if not (int(rows.min()) >= -1 and int(rows.max()) < len(table) - 1):
-                raise ValueError(f"{key} has no such row")
+        joined = Track.of(found)
         if lengths.shape != (count,) or int(lengths.min()) < 1:
-            raise ValueError(f"it is not of {count} recordings")
+            raise ValueError(f"not of {count} recordings")
+        _require_alike(joined, joined, str(folder))
     return found | {"length": lengths}
 
 
@@ -250,9 +243,7 @@ def forget_old(used: Path) -> None:
 class Known:
     """What is known of a data set's recordings without their frames, by their checksums."""
 
-    usable: dict[str, bool] = field(default_factory=dict)
-    handled: dict[str, bool] = field(default_factory=dict)
-    """Whether objects are handled."""
+    facts: dict[str, tuple[bool, bool]] = field(default_factory=dict)
     twins: dict[str, dict[str, list[int]]] = field(default_factory=dict)
 
     @classmethod
@@ -267,13 +258,6 @@ class Known:
         if self != Known.of(folder):
             with suppress(WearcapError):  # a data set that is only read
                 write_text(folder / _KNOWN, json.dumps(asdict(self)))
-
-
-def once(facts: dict[str, _Fact], recording: str, find: Callable[[], _Fact]) -> _Fact:
-    """A fact of a recording, found if it is not known."""
-    if recording not in facts:
-        facts[recording] = find()
-    return facts[recording]
 
 
 def require_rows(values: dict[str, Any], where: str | Path) -> None:

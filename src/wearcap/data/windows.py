@@ -20,7 +20,7 @@ from wearcap.data.arm_mixing import ArmDonors
 from wearcap.data.batch import Batch, Transform
 from wearcap.data.bodies import OtherBodies
 from wearcap.data.draws import Draws
-from wearcap.data.packing import Known, Packed, Track, forget_old, kept_track, once
+from wearcap.data.packing import Known, Packed, Track, forget_old, kept_track
 from wearcap.data.transforms import Cutting, TimeStretch
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
@@ -124,9 +124,7 @@ class Windows:
         stretch = max((each.factor for each in chosen if isinstance(each, TimeStretch)), default=1.0)
         stores = [RecordingStore.open(source.root) for source in sources]
         content.prepare(stores, split)
-        key = _key(content)
-        known = {store.root: Known.of(_folder(store, key)) for store in stores}
-        least, rows, found = content.min_frames(window, stretch), [], list[_Chosen]()
+        least, rows, found, kept = content.min_frames(window, stretch), [], list[_Chosen](), _Kept(content, stores)
         for source, store in zip(sources, stores):
             rate, entries = _rows(store, split, fps, every)
             entries = [(name, frames) for name, frames in entries if frames >= least * rate]
@@ -134,14 +132,13 @@ class Windows:
             power = balance if split == "train" else 1.0
             total = sum(count**power for count in counts)
             for (name, _), count in zip(entries, counts):
-                sha256, facts = store.entries[name].sha256, known[store.root]
-                if once(facts.usable, sha256, partial(content.usable, store, name)):
+                usable, handled = kept.facts(store, name)
+                if usable:
                     step = 1 if content.own_rate else rate
                     rows += [(len(found), k * stride * step, step) for k in range(count)]
                     weight = source.weight * count ** (power - 1) / total
-                    varied = self.bodies is not None and source.bodies
-                    varied = varied and not once(facts.handled, sha256, partial(_handled, store, name))
-                    found.append(_Chosen(store, name, rate, varied, count, weight))
+                    varied = self.bodies is not None and source.bodies and not handled
+                    found.append(_Chosen(store, name, store.entries[name].sha256, rate, varied, count, weight))
         if not rows:
             what = f"no windows in split {split!r}"
             expected = f"recordings of at least {least} frames{content.requires}"
@@ -150,15 +147,11 @@ class Windows:
             raise WearcapError(f"recordings of {sorted(steps)} frames per frame of a window", expected="one rate")
         self.recordings, self.starts, self.step = found, torch.tensor(rows)[:, :2], rows[0][2]
         self.weights = torch.tensor([each.weight for each in found for _ in range(each.count)], dtype=torch.float64)
-        first = found[0]
-        twins = once(known[first.store.root].twins, first.sha256, lambda: content.twins(first.file))
-        for store in stores:
-            known[store.root].keep(_folder(store, key))
-        self._pack(found, key)
-        self.twins = self.packed.twins(twins)
+        self._pack(found, kept)
 
-    def _pack(self, found: Sequence["_Chosen"], key: str) -> None:
+    def _pack(self, found: Sequence["_Chosen"], kept: "_Kept") -> None:
         """Keep the recordings' tracks, and those of people who move others' arms."""
+        twins = kept.twins(found[0])
         made, varied = [(each, 0) for each in found], [each.varied for each in found]
         versions = torch.arange(len(found))[:, None]
         if self.bodies is not None and self.bodies.arms and any(varied):
@@ -166,18 +159,8 @@ class Windows:
             mixed = torch.tensor(varied).nonzero()[:, 0]
             versions[mixed] = len(found) + torch.arange(len(mixed) * ARM_VERSIONS).reshape(-1, ARM_VERSIONS)
             made += [(found[each], version) for each in mixed.tolist() for version in range(1, ARM_VERSIONS + 1)]
-        kept = _Kept(self.content, key, [each for each in found if each.varied])
-
-        def tracks() -> Iterator[Track]:
-            for each in progress(made, "packing recordings", transient=True, disable=len(made) < 8):
-                track = kept(*each)
-                yield _of_wearer(track, self.content.parts) if self.bodies is None else track
-
-        whole = digest([kept.name(*each) for each in made], self.bodies is None)[:24]
-        joined = _folder(found[0].store, key) / f"joined-{whole}"
-        self.packed = Packed.kept(joined, tracks, [each.name for each, _ in made])
-        for used in {joined, *(_folder(each.store, key) for each in found)}:
-            forget_old(used)
+        self.packed = kept.packed(made, summed=self.bodies is None)
+        self.twins = self.packed.twins(twins)
         self.varied, self.versions = torch.tensor(varied), versions
 
     def __len__(self) -> int:
@@ -229,6 +212,7 @@ class _Chosen:
 
     store: RecordingStore
     name: str
+    sha256: str
     rate: int
     varied: bool
     """Whether other people do its motion."""
@@ -236,31 +220,57 @@ class _Chosen:
     weight: float
 
     @property
-    def sha256(self) -> str:
-        return self.store.entries[self.name].sha256
-
-    @property
     def file(self) -> RecordingFile:
         return RecordingFile(self.store.path_of(self.name))
 
 
 class _Kept:
-    """Makes the tracks of recordings, or takes them from their data sets' caches."""
+    """What is made of recordings once, and kept in their data sets' caches."""
 
-    def __init__(self, content: Content, key: str, donors: list[_Chosen]):
-        """`donors`: recordings whose arms others may move, in their own data set."""
-        self.content, self.key, self.donors = content, key, donors
+    def __init__(self, content: Content, stores: Sequence[RecordingStore]):
+        modules = [each.__module__ for each in type(content).__mro__ if each.__module__.startswith("wearcap.")]
+        key = digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
+        self.content, self.folders = content, {each.root: each.root / "cache" / f"windows-{key}" for each in stores}
+        self._known = {root: Known.of(folder) for root, folder in self.folders.items()}
         self._arms = cache(self._arms_in)
-        self._group = cache(lambda root: digest([each.sha256 for each in donors if each.store.root == root])[:16])
 
-    def name(self, each: _Chosen, version: int) -> str:
-        """Name of a track: what decides, beside the key, what it is."""
-        name = f"{each.sha256[:32]}-{each.rate}"
-        return f"{name}-{version}-{self._group(each.store.root)}" if version else name
+    def facts(self, store: RecordingStore, name: str) -> tuple[bool, bool]:
+        """Whether a recording is usable, and whether objects are handled in it, which other arms would not reach."""
+        facts, sha256 = self._known[store.root].facts, store.entries[name].sha256
+        if sha256 not in facts:
+            handled = any(key.startswith("object_motion.") for key in RecordingFile(store.path_of(name)).keys)
+            facts[sha256] = self.content.usable(store, name), handled
+        return facts[sha256]
 
-    def __call__(self, each: _Chosen, version: int) -> Track:
-        path = _folder(each.store, self.key) / f"{self.name(each, version)}.safetensors"
-        return kept_track(path, lambda: self._made(each, version))
+    def twins(self, each: _Chosen) -> dict[str, list[int]]:
+        """The content's `twins`. What is known of recordings is written."""
+        twins = self._known[each.store.root].twins
+        if each.sha256 not in twins:
+            twins[each.sha256] = self.content.twins(each.file)
+        for root, folder in self.folders.items():
+            self._known[root].keep(folder)
+        return twins[each.sha256]
+
+    def packed(self, made: Sequence[tuple[_Chosen, int]], summed: bool) -> Packed:
+        """Tracks of recordings and their versions, where these are not 0 with arms of others in their own data set.
+
+        `summed`: of the wearers alone, with sums over the body's parts.
+        """
+        self.donors = [each for each, version in made if each.varied and not version]
+        groups = {root: digest([each.sha256 for each in self._donors(root)])[:16] for root in self.folders}
+        names = [f"{each.sha256[:32]}-{each.rate}" + f"-{k}-{groups[each.store.root]}" * (k > 0) for each, k in made]
+
+        def tracks() -> Iterator[Track]:
+            for each, name in zip(progress(made, "packing recordings", transient=True, disable=len(made) < 8), names):
+                path = self.folders[each[0].store.root] / f"{name}.safetensors"
+                track = kept_track(path, partial(self._made, *each))
+                yield _of_wearer(track, self.content.parts) if summed else track
+
+        joined = self.folders[made[0][0].store.root] / f"joined-{digest(names, summed)[:24]}"
+        packed = Packed.kept(joined, tracks, [each.name for each, _ in made])
+        for used in (joined, *self.folders.values()):
+            forget_old(used)
+        return packed
 
     def _made(self, each: _Chosen, version: int) -> Track:
         recording = each.file.load()
@@ -271,9 +281,12 @@ class _Kept:
         return self.content.track(each.store, each.name, recording, each.rate)
 
     def _arms_in(self, root: Path) -> ArmDonors:
-        donors = [each for each in self.donors if each.store.root == root]
+        donors = self._donors(root)
         frames = sum(each.store.entries[each.name].frames for each in donors)
         return ArmDonors([each.file for each in donors[:: 1 + frames // ARM_FRAMES]])
+
+    def _donors(self, root: Path) -> list[_Chosen]:
+        return [each for each in self.donors if each.store.root == root]
 
 
 def _of_wearer(track: Track, parts: frozenset[str]) -> Track:
@@ -283,22 +296,6 @@ def _of_wearer(track: Track, parts: frozenset[str]) -> Track:
         for each in (track.values, track.constants)
     )
     return Track(values, constants, track.tables)
-
-
-def _handled(store: RecordingStore, name: str) -> bool:
-    """Whether objects are handled in a recording, which other arms would not reach."""
-    return any(key.startswith("object_motion.") for key in RecordingFile(store.path_of(name)).keys)
-
-
-def _key(content: Content) -> str:
-    """What decides, beside a recording, what is kept of it."""
-    modules = [each.__module__ for each in type(content).__mro__ if each.__module__.startswith("wearcap.")]
-    return digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
-
-
-def _folder(store: RecordingStore, key: str) -> Path:
-    """Where a data set keeps it."""
-    return store.root / "cache" / f"windows-{key}"
 
 
 def _rows(store: RecordingStore, split: str, fps: float, every: int | None) -> tuple[int, list[tuple[str, int]]]:
