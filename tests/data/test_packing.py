@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from drawn_windows import numbers
-from wearcap.data.packing import KEPT, Packed, Track, kept_track, quantized, require_rows
+from wearcap.data.packing import KEPT, Packed, Track, joined, kept_track, quantized, require_rows
 from wearcap.data.transforms import Shift
 from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
@@ -27,7 +27,7 @@ def test_rotations_are_kept_within_a_hundredth_of_a_degree():
 
 def test_recordings_lie_one_after_another():
     parts = [torch.arange(3.0), torch.arange(5.0) + 10]
-    packed = Packed([Track({"floor": part}, {"size": part[:2]}) for part in parts], ["a", "b"])
+    packed = Packed(*joined([Track({"floor": part}, {"size": part[:2]}) for part in parts], ["a", "b"]))
     assert packed.values["floor"].tolist() == [0, 1, 2, 10, 11, 12, 13, 14]
     assert (packed.first.tolist(), packed.length.tolist()) == ([0, 3], [3, 5])
     assert packed.constants["size"].tolist() == [[0, 1], [10, 11]]
@@ -45,7 +45,7 @@ def test_recordings_lie_one_after_another():
 def test_recordings_of_other_shapes_are_refused(other, message):
     first = Track({"t": torch.zeros(9, 23, 3)}, {"size": torch.zeros(5)})
     with pytest.raises(WearcapError, match=message):
-        Packed([first, other], ["a", "b"])
+        Packed(*joined([first, other], ["a", "b"]))
     with pytest.raises(WearcapError, match="different lengths.*'b': 4"):
         require_rows({"a": first.values["t"], "b": other.values["t"]}, "file")
 
@@ -62,7 +62,7 @@ def test_recordings_of_other_shapes_are_refused(other, message):
 )
 def test_rows_that_compiled_loops_would_read_beyond_are_refused(track):
     with pytest.raises(WearcapError, match="rows do not belong together.*cache/windows"):
-        Packed([track], ["a"])
+        Packed(*joined([track], ["a"]))
 
 
 def test_a_track_is_the_same_from_its_file(tmp_path):

@@ -5,8 +5,10 @@ holds; the augmentations of `transforms.py` stand between the two. Mean and scal
 split are computed of windows drawn from it, and saved with the weights.
 """
 
+import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,13 +18,15 @@ from jaxtyping import Float, Int64
 from rich.progress import track as progress
 from torch import Tensor
 
+from wearcap.boundary.texts import read_json, require_layout
 from wearcap.data.arm_mixing import ArmDonors
 from wearcap.data.batch import Batch, Transform
 from wearcap.data.bodies import OtherBodies
 from wearcap.data.draws import Draws
-from wearcap.data.packing import Known, Packed, Track, forget_old, kept_track
+from wearcap.data.packing import Packed, Track, forget_old, kept, kept_track
 from wearcap.data.transforms import Cutting, TimeStretch
 from wearcap.errors import WearcapError
+from wearcap.files import write_text
 from wearcap.models.layers import Normalizer
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
@@ -124,7 +128,7 @@ class Windows:
         stretch = max((each.factor for each in chosen if isinstance(each, TimeStretch)), default=1.0)
         stores = [RecordingStore.open(source.root) for source in sources]
         content.prepare(stores, split)
-        least, rows, found, kept = content.min_frames(window, stretch), [], list[_Chosen](), _Kept(content, stores)
+        least, rows, found, cached = content.min_frames(window, stretch), [], list[_Chosen](), _Cached(content, stores)
         for source, store in zip(sources, stores):
             rate, entries = _rows(store, split, fps, every)
             entries = [(name, frames) for name, frames in entries if frames >= least * rate]
@@ -132,7 +136,7 @@ class Windows:
             power = balance if split == "train" else 1.0
             total = sum(count**power for count in counts)
             for (name, _), count in zip(entries, counts):
-                usable, handled = kept.facts(store, name)
+                usable, handled = cached.facts(store, name)
                 if usable:
                     step = 1 if content.own_rate else rate
                     rows += [(len(found), k * stride * step, step) for k in range(count)]
@@ -147,11 +151,10 @@ class Windows:
             raise WearcapError(f"recordings of {sorted(steps)} frames per frame of a window", expected="one rate")
         self.recordings, self.starts, self.step = found, torch.tensor(rows)[:, :2], rows[0][2]
         self.weights = torch.tensor([each.weight for each in found for _ in range(each.count)], dtype=torch.float64)
-        self._pack(found, kept)
+        self._pack(found, cached)
 
-    def _pack(self, found: Sequence["_Chosen"], kept: "_Kept") -> None:
+    def _pack(self, found: Sequence["_Chosen"], cached: "_Cached") -> None:
         """Keep the recordings' tracks, and those of people who move others' arms."""
-        twins = kept.twins(found[0])
         made, varied = [(each, 0) for each in found], [each.varied for each in found]
         versions = torch.arange(len(found))[:, None]
         if self.bodies is not None and self.bodies.arms and any(varied):
@@ -159,8 +162,7 @@ class Windows:
             mixed = torch.tensor(varied).nonzero()[:, 0]
             versions[mixed] = len(found) + torch.arange(len(mixed) * ARM_VERSIONS).reshape(-1, ARM_VERSIONS)
             made += [(found[each], version) for each in mixed.tolist() for version in range(1, ARM_VERSIONS + 1)]
-        self.packed = kept.packed(made, summed=self.bodies is None)
-        self.twins = self.packed.twins(twins)
+        self.packed = cached.packed(made, summed=self.bodies is None)
         self.varied, self.versions = torch.tensor(varied), versions
 
     def __len__(self) -> int:
@@ -169,7 +171,6 @@ class Windows:
     def to(self, device: torch.device) -> "Windows":
         """Draw on a device, which then holds all recordings."""
         self.packed.to(device)
-        self.twins = {name: order.to(device) for name, order in self.twins.items()}
         self.starts, self.weights = self.starts.to(device), self.weights.to(device)
         self.varied, self.versions = self.varied.to(device), self.versions.to(device)
         return self
@@ -187,7 +188,7 @@ class Windows:
             self.fps,
             stride=self.stride * self.step,
             step=self.step,
-            twins=self.twins,
+            twins=self.packed.twins,
             sensed=content.sensed,
             jumps=content.jumps,
             varied=self.varied[track],
@@ -215,7 +216,6 @@ class _Chosen:
     sha256: str
     rate: int
     varied: bool
-    """Whether other people do its motion."""
     count: int
     weight: float
 
@@ -224,15 +224,25 @@ class _Chosen:
         return RecordingFile(self.store.path_of(self.name))
 
 
-class _Kept:
+@dataclass
+class _Known:
+    """What is known of a data set's recordings without their frames, by checksums: usable or not, handling objects or not."""
+
+    facts: dict[str, tuple[bool, bool]] = field(default_factory=dict)
+
+
+class _Cached:
     """What is made of recordings once, and kept in their data sets' caches."""
 
     def __init__(self, content: Content, stores: Sequence[RecordingStore]):
         modules = [each.__module__ for each in type(content).__mro__ if each.__module__.startswith("wearcap.")]
         key = digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
         self.content, self.folders = content, {each.root: each.root / "cache" / f"windows-{key}" for each in stores}
-        self._known = {root: Known.of(folder) for root, folder in self.folders.items()}
-        self._arms = cache(self._arms_in)
+        self._known, self._new = {root: _Known() for root in self.folders}, set[Path]()
+        for root, folder in self.folders.items():
+            with suppress(WearcapError):  # none yet, or a damaged file
+                self._known[root] = require_layout(read_json(folder / "known.json"), _Known, folder)
+        self._arms, self._donors = cache(self._arms_in), {root: list[_Chosen]() for root in self.folders}
 
     def facts(self, store: RecordingStore, name: str) -> tuple[bool, bool]:
         """Whether a recording is usable, and whether objects are handled in it, which other arms would not reach."""
@@ -240,24 +250,21 @@ class _Kept:
         if sha256 not in facts:
             handled = any(key.startswith("object_motion.") for key in RecordingFile(store.path_of(name)).keys)
             facts[sha256] = self.content.usable(store, name), handled
+            self._new.add(store.root)
         return facts[sha256]
-
-    def twins(self, each: _Chosen) -> dict[str, list[int]]:
-        """The content's `twins`. What is known of recordings is written."""
-        twins = self._known[each.store.root].twins
-        if each.sha256 not in twins:
-            twins[each.sha256] = self.content.twins(each.file)
-        for root, folder in self.folders.items():
-            self._known[root].keep(folder)
-        return twins[each.sha256]
 
     def packed(self, made: Sequence[tuple[_Chosen, int]], summed: bool) -> Packed:
         """Tracks of recordings and their versions, where these are not 0 with arms of others in their own data set.
 
         `summed`: of the wearers alone, with sums over the body's parts.
         """
-        self.donors = [each for each, version in made if each.varied and not version]
-        groups = {root: digest([each.sha256 for each in self._donors(root)])[:16] for root in self.folders}
+        for root in self._new:
+            with suppress(WearcapError):  # a data set that is only read
+                write_text(self.folders[root] / "known.json", json.dumps(vars(self._known[root])))
+        for each, version in made:
+            if each.varied and not version:
+                self._donors[each.store.root].append(each)
+        groups = {root: digest([each.sha256 for each in donors])[:16] for root, donors in self._donors.items()}
         names = [f"{each.sha256[:32]}-{each.rate}" + f"-{k}-{groups[each.store.root]}" * (k > 0) for each, k in made]
 
         def tracks() -> Iterator[Track]:
@@ -266,27 +273,26 @@ class _Kept:
                 track = kept_track(path, partial(self._made, *each))
                 yield _of_wearer(track, self.content.parts) if summed else track
 
-        joined = self.folders[made[0][0].store.root] / f"joined-{digest(names, summed)[:24]}"
-        packed = Packed.kept(joined, tracks, [each.name for each, _ in made])
-        for used in (joined, *self.folders.values()):
+        whole = self.folders[made[0][0].store.root] / f"joined-{digest(names, summed)[:24]}"
+        packed = Packed(*kept(whole, tracks, [each.name for each, _ in made]))
+        for used in (whole, *self.folders.values()):
             forget_old(used)
         return packed
 
     def _made(self, each: _Chosen, version: int) -> Track:
-        recording = each.file.load()
+        file = each.file
+        recording = file.load()
         if version and recording.motion is not None:
             seed = int(each.sha256[:8], 16) + version
-            mixed = self._arms(each.store.root).mixed(recording.motion, each.file, seed)
+            mixed = self._arms(each.store.root).mixed(recording.motion, file, seed)
             recording = replace(recording, motion=mixed)
-        return self.content.track(each.store, each.name, recording, each.rate)
+        twins = {name: torch.tensor(order) for name, order in self.content.twins(file).items()}
+        return replace(self.content.track(each.store, each.name, recording, each.rate), twins=twins)
 
     def _arms_in(self, root: Path) -> ArmDonors:
-        donors = self._donors(root)
+        donors = self._donors[root]
         frames = sum(each.store.entries[each.name].frames for each in donors)
         return ArmDonors([each.file for each in donors[:: 1 + frames // ARM_FRAMES]])
-
-    def _donors(self, root: Path) -> list[_Chosen]:
-        return [each for each in self.donors if each.store.root == root]
 
 
 def _of_wearer(track: Track, parts: frozenset[str]) -> Track:
@@ -295,7 +301,7 @@ def _of_wearer(track: Track, parts: frozenset[str]) -> Track:
         {name: value.sum(-2) if name in parts else value for name, value in each.items()}
         for each in (track.values, track.constants)
     )
-    return Track(values, constants, track.tables)
+    return replace(track, values=values, constants=constants)
 
 
 def _rows(store: RecordingStore, split: str, fps: float, every: int | None) -> tuple[int, list[tuple[str, int]]]:
