@@ -1,8 +1,7 @@
 """Recordings packed for training: all values of a kind in one tensor, the recordings' rows one after another.
 
-Rotations are quaternions of 16-bit numbers (off by less than 0.004 degrees). What a recording becomes is kept in a file
-of the data set's cache, so that one that grew is not packed anew; what all become is kept there once more, in files that the
-next training maps to memory: it starts at once, and reads what it draws.
+Rotations are quaternions of 16-bit numbers (off by less than 0.004 degrees). What a recording becomes is kept in a file of
+the data set's cache, and what all become in files that the next training maps to memory: it starts at once.
 """
 
 import math
@@ -90,8 +89,7 @@ class Packed:
 
     def __init__(self, whole: Track, length: Int64[Tensor, "track"]):
         """Of what `joined` or `kept` gives. Raises WearcapError for a mirror by which compiled loops would write beyond."""
-        self.length = length
-        self.first: Int64[Tensor, "track"] = length.cumsum(0) - length
+        self.length, self.first = length, length.cumsum(0) - length
         self.values, self.constants, self.tables = whole.values, whole.constants, whole.tables
         self.twins = {name: order[0] for name, order in whole.twins.items()}
         for name, order in self.twins.items():
@@ -135,10 +133,7 @@ def _kinds(values: dict[str, Tensor], part: str) -> dict[str, tuple]:
 
 
 def _numbered(tracks: Iterable[Track], names: Sequence[str]) -> Iterator[dict[str, Tensor]]:
-    """Rows that tracks add to what is joined; each table ends with one of zeros, to which -1 refers.
-
-    `names` of the recordings, for messages. Raises WearcapError for tracks with other values than the first one.
-    """
+    """Rows that tracks add to what is joined; each table ends with one of zeros, to which -1 refers."""
     first, before = None, Counter[str]()
     for track, name in zip(tracks, names, strict=True):
         first = first or track
@@ -155,7 +150,7 @@ def _numbered(tracks: Iterable[Track], names: Sequence[str]) -> Iterator[dict[st
 
 
 def joined(tracks: Iterable[Track], names: Sequence[str]) -> tuple[Track, Int64[Tensor, "track"]]:
-    """Rows of all tracks, in memory, and the tracks' lengths. Raises as `_numbered`."""
+    """Rows of all tracks, in memory, and the tracks' lengths. Raises WearcapError for tracks of other kinds than the first."""
     parts = [*_numbered(tracks, names)]
     whole = {key: torch.cat([rows[key] for rows in parts if key in rows]) for key in parts[0]}
     length = whole.pop("length")
@@ -172,12 +167,11 @@ def kept(folder: Path, tracks: Callable[[], Iterable[Track]], names: Sequence[st
             _write(folder, _numbered(tracks(), names))
         except WearcapError:  # a data set that is only read, or a full disk; or what the tracks are refused for
             return joined(tracks(), names)
-    index, found = read_tensors(folder / _INDEX, "packed data set", _FIX)[1], dict[str, Tensor]()
+    found: dict[str, Tensor] = {}
     with understood(_APART, folder, fix=_FIX, errors=(OSError, LookupError, RuntimeError, TypeError, ValueError)):
-        for key, kind in index.items():
+        for key, kind in read_tensors(folder / _INDEX, "packed data set", _FIX)[1].items():
             path, shape = path_inside(folder, key, folder), kind.shape[1:]
-            size = math.prod(shape)
-            if path.stat().st_size != size * kind.itemsize:
+            if path.stat().st_size != (size := math.prod(shape)) * kind.itemsize:
                 raise ValueError(f"{key} is not of {shape[0]} rows")
             found[key] = torch.from_file(str(path), shared=False, size=size, dtype=kind.dtype).reshape(shape)
         length = found.pop("length")
@@ -202,11 +196,8 @@ def _write(folder: Path, parts: Iterator[dict[str, Tensor]]) -> None:
 
 def kept_track(path: Path, make: Callable[[], Track]) -> Track:
     """The track of a recording from a file of its data set's cache, made if it is missing; damaged ones are made anew."""
-    if path.is_file():
-        try:
-            return Track.of(read_tensors(path, "packed recording")[1])
-        except WearcapError:
-            path.unlink(missing_ok=True)
+    with suppress(WearcapError):
+        return Track.of(read_tensors(path, "packed recording")[1])
     track = make().packed()
     with suppress(WearcapError):  # a data set that is only read, or a full disk: the training needs no file
         write_tensors(path, track.flat())
@@ -217,9 +208,8 @@ def forget_old(used: Path) -> None:
     """Remove all but `KEPT` folders of a kind ("windows-…"): the one in use, and those beside it that were used last."""
     with suppress(OSError):  # a data set that is only read, or another process that removes them
         os.utime(used)
-        kind = used.name.split("-")[0]
-        folders = sorted(used.parent.glob(f"{kind}-*"), key=lambda folder: folder.stat().st_mtime, reverse=True)
-        for folder in folders[KEPT:]:
+        folders = used.parent.glob(used.name.split("-")[0] + "-*")
+        for folder in sorted(folders, key=lambda folder: folder.stat().st_mtime, reverse=True)[KEPT:]:
             shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -8,7 +8,7 @@ split are computed of windows drawn from it, and saved with the weights.
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,7 +18,7 @@ from jaxtyping import Float, Int64
 from rich.progress import track as progress
 from torch import Tensor
 
-from wearcap.boundary.texts import read_json, require_layout
+from wearcap.boundary.texts import read_json_object
 from wearcap.data.arm_mixing import ArmDonors
 from wearcap.data.batch import Batch, Transform
 from wearcap.data.bodies import OtherBodies
@@ -224,13 +224,6 @@ class _Chosen:
         return RecordingFile(self.store.path_of(self.name))
 
 
-@dataclass
-class _Known:
-    """What is known of a data set's recordings without their frames, by checksums: usable or not, handling objects or not."""
-
-    facts: dict[str, tuple[bool, bool]] = field(default_factory=dict)
-
-
 class _Cached:
     """What is made of recordings once, and kept in their data sets' caches."""
 
@@ -238,15 +231,15 @@ class _Cached:
         modules = [each.__module__ for each in type(content).__mro__ if each.__module__.startswith("wearcap.")]
         key = digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
         self.content, self.folders = content, {each.root: each.root / "cache" / f"windows-{key}" for each in stores}
-        self._known, self._new = {root: _Known() for root in self.folders}, set[Path]()
+        self._known, self._new = {root: dict[str, tuple[bool, bool]]() for root in self.folders}, set[Path]()
         for root, folder in self.folders.items():
-            with suppress(WearcapError):  # none yet, or a damaged file
-                self._known[root] = require_layout(read_json(folder / "known.json"), _Known, folder)
-        self._arms, self._donors = cache(self._arms_in), {root: list[_Chosen]() for root in self.folders}
+            with suppress(WearcapError, TypeError, ValueError):  # none yet, or a damaged file
+                self._known[root] = {key: (a, b) for key, (a, b) in read_json_object(folder / "known.json").items()}
+        self._arms = cache(self._arms_in)
 
     def facts(self, store: RecordingStore, name: str) -> tuple[bool, bool]:
         """Whether a recording is usable, and whether objects are handled in it, which other arms would not reach."""
-        facts, sha256 = self._known[store.root].facts, store.entries[name].sha256
+        facts, sha256 = self._known[store.root], store.entries[name].sha256
         if sha256 not in facts:
             handled = any(key.startswith("object_motion.") for key in RecordingFile(store.path_of(name)).keys)
             facts[sha256] = self.content.usable(store, name), handled
@@ -254,18 +247,13 @@ class _Cached:
         return facts[sha256]
 
     def packed(self, made: Sequence[tuple[_Chosen, int]], summed: bool) -> Packed:
-        """Tracks of recordings and their versions, where these are not 0 with arms of others in their own data set.
-
-        `summed`: of the wearers alone, with sums over the body's parts.
-        """
+        """Recordings and versions (not 0: with arms of others in their data set), `summed` over the body's parts or not."""
         for root in self._new:
             with suppress(WearcapError):  # a data set that is only read
-                write_text(self.folders[root] / "known.json", json.dumps(vars(self._known[root])))
-        for each, version in made:
-            if each.varied and not version:
-                self._donors[each.store.root].append(each)
-        groups = {root: digest([each.sha256 for each in donors])[:16] for root, donors in self._donors.items()}
-        names = [f"{each.sha256[:32]}-{each.rate}" + f"-{k}-{groups[each.store.root]}" * (k > 0) for each, k in made]
+                write_text(self.folders[root] / "known.json", json.dumps(self._known[root]))
+        self.donors = [each for each, version in made if each.varied and not version]
+        group = cache(lambda root: digest([each.sha256 for each in self.donors if each.store.root == root])[:16])
+        names = [f"{each.sha256[:32]}-{each.rate}" + f"-{k}-{group(each.store.root)}" * (k > 0) for each, k in made]
 
         def tracks() -> Iterator[Track]:
             for each, name in zip(progress(made, "packing recordings", transient=True, disable=len(made) < 8), names):
@@ -280,8 +268,7 @@ class _Cached:
         return packed
 
     def _made(self, each: _Chosen, version: int) -> Track:
-        file = each.file
-        recording = file.load()
+        recording = (file := each.file).load()
         if version and recording.motion is not None:
             seed = int(each.sha256[:8], 16) + version
             mixed = self._arms(each.store.root).mixed(recording.motion, file, seed)
@@ -290,7 +277,7 @@ class _Cached:
         return replace(self.content.track(each.store, each.name, recording, each.rate), twins=twins)
 
     def _arms_in(self, root: Path) -> ArmDonors:
-        donors = self._donors[root]
+        donors = [each for each in self.donors if each.store.root == root]
         frames = sum(each.store.entries[each.name].frames for each in donors)
         return ArmDonors([each.file for each in donors[:: 1 + frames // ARM_FRAMES]])
 
