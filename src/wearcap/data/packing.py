@@ -183,6 +183,7 @@ def kept(folder: Path, tracks: Callable[[], Iterable[Track]], names: Sequence[st
 
 
 def _write(folder: Path, parts: Iterator[dict[str, Tensor]]) -> None:
+    """Write rows to a file of each kind as they come, and the index once all are there."""
     index, files = dict[str, Tensor](), dict[str, BinaryIO]()
     with ExitStack() as stack:
         for key, value in (item for rows in parts for item in rows.items()):
