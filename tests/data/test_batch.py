@@ -12,7 +12,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.data import batch as batches
 from wearcap.data.batch import Batch, Rows
 from wearcap.data.draws import Draws
-from wearcap.data.packing import Packed, Track, quantized
+from wearcap.data.packing import Packed, Track, joined, quantized
 from wearcap.data.transforms import joint_twins
 from wearcap.geometry import rotation
 from wearcap_testing import swaying_motion
@@ -63,7 +63,7 @@ def track(frames: int, seed: int) -> Track:
 
 
 TRACKS = [track(*each) for each in ((70, 0), (14, 1), (90, 2))]  # one is shorter than a window
-PACKED = Packed([each.packed() for each in TRACKS], ["a", "b", "c"])
+PACKED = Packed(*joined([each.packed() for each in TRACKS], ["a", "b", "c"]))
 
 
 def batch(**changes) -> Batch:

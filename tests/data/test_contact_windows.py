@@ -15,7 +15,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.data.batch import Batch
 from wearcap.data.draws import Draws
-from wearcap.data.packing import Packed, Track
+from wearcap.data.packing import Packed, Track, joined
 from wearcap.data.transforms import DropFrames, Mirror, Shift, TimeStretch, mirrored_rotations
 from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
@@ -85,7 +85,10 @@ def test_stretched_windows_keep_poses_and_truth_together(root):
 
 
 def batch_of(R: torch.Tensor, count: int = 1, **changes) -> Batch:
-    packed, zeros = Packed([Track({"R_parent_joint": R}).packed()], ["one"]), torch.zeros(count, dtype=torch.long)
+    packed, zeros = (
+        Packed(*joined([Track({"R_parent_joint": R}).packed()], ["one"])),
+        torch.zeros(count, dtype=torch.long),
+    )
     sensed = frozenset({"R_parent_joint"})
     return Batch(packed, Draws(torch.arange(count)), zeros, zeros, len(R) - 1, 60.0, sensed=sensed, **changes)
 

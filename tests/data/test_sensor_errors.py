@@ -8,7 +8,7 @@ from benchmarks.rivals.single_windows import transforms as before
 from drawn_windows import one, single
 from wearcap.data.batch import Batch
 from wearcap.data.draws import Draws
-from wearcap.data.packing import Packed, Track
+from wearcap.data.packing import Packed, Track, joined
 from wearcap.data.transforms import SensorErrors, WatchErrors, slam_paths
 from wearcap.data.windows import Source, Windows
 from wearcap.geometry import rotation
@@ -75,7 +75,10 @@ def walk() -> dict[str, torch.Tensor]:
 
 def batch_of(values: dict[str, torch.Tensor], count: int, draws: Draws | None = None) -> Batch:
     """Windows that are all the same, with further seeds."""
-    packed, zeros = Packed([Track({"none": torch.zeros(FRAMES)})], ["one"]), torch.zeros(count, dtype=torch.long)
+    packed, zeros = (
+        Packed(*joined([Track({"none": torch.zeros(FRAMES)})], ["one"])),
+        torch.zeros(count, dtype=torch.long),
+    )
     values = {name: value.expand(count, *value.shape) for name, value in values.items()}
     return Batch(packed, draws or Draws(torch.arange(count)), zeros, zeros, FRAMES, FPS, values=values)
 

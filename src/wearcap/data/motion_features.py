@@ -129,4 +129,4 @@ class MovementContent(Content):
         return Track({"t_world_joint": joints, "R_world_root": R_world_root, "floor_height": floor_height})
 
     def batch(self, batch: Batch) -> Movement:
-        return Movement(*batch.values.values())
+        return Movement(*(batch.values[name] for name in ("t_world_joint", "R_world_root", "floor_height")))

@@ -1,27 +1,35 @@
 """Recordings packed for training: all values of a kind in one tensor, the recordings' rows one after another.
 
-Rotations are quaternions of 16-bit numbers (off by less than 0.004 degrees). What a recording becomes is kept in a file
-of the data set's cache, so that the next training starts at once.
+Rotations are quaternions of 16-bit numbers (off by less than 0.004 degrees). What a recording becomes is kept in a file of
+the data set's cache, and what all become in files that the next training maps to memory: it starts at once.
 """
 
+import math
 import os
 import shutil
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from jaxtyping import Float, Int16, Int64
 from torch import Tensor
 
+from wearcap.boundary.opening import path_inside, understood
 from wearcap.boundary.tensors import read_tensors, write_tensors
 from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
 from wearcap.geometry import rotation
 
 KEPT = 4
-"""Number of different packings of a data set, those that were used last, whose files are kept."""
+"""Number of different packings of a data set, those that were used last, whose files are kept; of each, of joined sets."""
+_INDEX = "index.safetensors"
+"""Of the files of a joined set: kind and number of their rows, as tensors "0 row ..." without content."""
+_APART = "a packed recording whose rows do not belong together"
+_FIX = "Delete the data set's cache/windows-… folders: they are made again."
 _STEP = float(torch.iinfo(torch.int16).max)
 
 
@@ -46,6 +54,8 @@ class Track:
     """Values of the wearer."""
     tables: dict[str, Tensor] = field(default_factory=dict)
     """Values of what frames refer to, "row ...", such as pictures and objects."""
+    twins: dict[str, Tensor] = field(default_factory=dict)
+    """What a mirror exchanges: the order of the places of values, "place"."""
 
     def flat(self) -> dict[str, Tensor]:
         """All tensors, as a file has them."""
@@ -67,7 +77,7 @@ class Track:
         values = {
             name: quantized(value) if is_rotation(name) else _single(value) for name, value in self.values.items()
         }
-        return Track(values, {name: _single(value) for name, value in self.constants.items()}, self.tables)
+        return Track(values, {name: _single(value) for name, value in self.constants.items()}, self.tables, self.twins)
 
 
 def _single(value: Tensor) -> Tensor:
@@ -77,22 +87,15 @@ def _single(value: Tensor) -> Tensor:
 class Packed:
     """Tracks of many recordings, each kind of value in one tensor."""
 
-    def __init__(self, tracks: Sequence[Track], names: Sequence[str]):
-        """`names` of the recordings, for messages. Raises WearcapError for tracks with other values than the first one."""
-        lengths = torch.tensor([len(next(iter(track.values.values()))) for track in tracks])
-        self.length: Int64[Tensor, "track"] = lengths
-        self.first: Int64[Tensor, "track"] = lengths.cumsum(0) - lengths
-        for track, name in zip(tracks, names):
-            _require_alike(track, tracks[0], name)
-        self.tables = {name: _joined([track.tables[name] for track in tracks], spare=1) for name in tracks[0].tables}
-        self.values = {name: _joined([track.values[name] for track in tracks]) for name in tracks[0].values}
-        self.constants = {
-            name: torch.stack([track.constants[name] for track in tracks]) for name in tracks[0].constants
-        }
-        for name in self.tables:
-            rows = torch.tensor([len(track.tables[name]) for track in tracks])
-            before = (rows.cumsum(0) - rows).repeat_interleave(lengths).to(self.values[name].dtype)
-            self.values[name] += before * (self.values[name] >= 0)  # -1 stays: the last row, of zeros
+    def __init__(self, whole: Track, length: Int64[Tensor, "track"]):
+        """Of what `joined` or `kept` gives. Raises WearcapError for a mirror by which compiled loops would write beyond."""
+        self.length, self.first = length, length.cumsum(0) - length
+        self.values, self.constants, self.tables = whole.values, whole.constants, whole.tables
+        self.twins = {name: order[0] for name, order in whole.twins.items()}
+        for name, order in self.twins.items():
+            places = self.values[name].shape[-1] if is_rotation(name) else len(order)
+            if sorted(order.tolist()) != list(range(places)):
+                raise WearcapError("a mirror that exchanges what is not there", name, f"each of {places} once", _FIX)
 
     @property
     def bytes(self) -> int:
@@ -101,7 +104,7 @@ class Packed:
 
     def to(self, device: torch.device) -> None:
         """Move all tensors to a device."""
-        for part in (self.tables, self.values, self.constants):
+        for part in (self.tables, self.values, self.constants, self.twins):
             part.update({name: value.to(device) for name, value in part.items()})
         self.first, self.length = self.first.to(device), self.length.to(device)
 
@@ -115,8 +118,7 @@ def _require_alike(track: Track, first: Track, name: str) -> None:
         for key in track.tables
     )
     if len(lengths) > 1 or not rows or any(R.dtype != torch.int16 or R.shape[1:-1] != (4,) for R in rotations):
-        fix = "Delete the data set's cache/windows-… folders: they are made again."
-        raise WearcapError("a packed recording whose rows do not belong together", where=name, fix=fix)
+        raise WearcapError(_APART, where=name, fix=_FIX)
     for part in fields(Track):
         found, expected = (_kinds(getattr(each, part.name), part.name) for each in (track, first))
         if found != expected:
@@ -127,40 +129,89 @@ def _require_alike(track: Track, first: Track, name: str) -> None:
 
 def _kinds(values: dict[str, Tensor], part: str) -> dict[str, tuple]:
     """Type and size of values, or of their rows."""
-    return {key: (value.dtype, *value.shape[0 if part == "constants" else 1 :]) for key, value in values.items()}
+    return {key: (value.dtype, *value.shape[part in ("values", "tables") :]) for key, value in values.items()}
 
 
-def _joined(parts: list[Tensor], spare: int = 0) -> Tensor:
-    """Rows of all parts, and further rows of zeros. Parts are let go one after another."""
-    rows = torch.zeros(sum(map(len, parts)) + spare, *parts[0].shape[1:], dtype=parts[0].dtype)
-    place = 0
-    for part in parts:
-        rows[place : place + len(part)] = part
-        place += len(part)
-    return rows
+def _numbered(tracks: Iterable[Track], names: Sequence[str]) -> Iterator[dict[str, Tensor]]:
+    """Rows that tracks add to what is joined; each table ends with one of zeros, to which -1 refers."""
+    first, before = None, Counter[str]()
+    for track, name in zip(tracks, names, strict=True):
+        first = first or track
+        _require_alike(track, first, name)
+        values = dict(track.values)
+        for key, table in track.tables.items():
+            values[key] = torch.where(values[key] >= 0, values[key] + before[key], values[key])
+            before[key] += len(table)
+        constants, twins = ({key: each[None] for key, each in part.items()} for part in (track.constants, track.twins))
+        length = torch.tensor([len(next(iter(values.values())))])
+        yield Track(values, constants, track.tables, twins).flat() | {"length": length}
+    if first is not None:
+        yield {f"tables.{key}": table.new_zeros(1, *table.shape[1:]) for key, table in first.tables.items()}
 
 
-def kept_track(root: Path, key: str, name: str, make: Callable[[], Track]) -> Track:
-    """The track of a recording from the cache of its data set, made if it is missing; damaged files are made anew."""
-    path = root / "cache" / f"windows-{key}" / f"{name}.safetensors"
-    if path.is_file():
+def joined(tracks: Iterable[Track], names: Sequence[str]) -> tuple[Track, Int64[Tensor, "track"]]:
+    """Rows of all tracks, in memory, and the tracks' lengths. Raises WearcapError for tracks of other kinds than the first."""
+    parts = [*_numbered(tracks, names)]
+    whole = {key: torch.cat([rows[key] for rows in parts if key in rows]) for key in parts[0]}
+    length = whole.pop("length")
+    return Track.of(whole), length
+
+
+def kept(folder: Path, tracks: Callable[[], Iterable[Track]], names: Sequence[str]) -> tuple[Track, Tensor]:
+    """As `joined`, mapped from a folder's files. They are written if they are missing, part by part, the index last.
+
+    Raises WearcapError, too, for damaged files, beyond which compiled loops would read.
+    """
+    if not (folder / _INDEX).is_file():
         try:
-            return Track.of(read_tensors(path, "packed recording")[1])
-        except WearcapError:
-            path.unlink(missing_ok=True)
+            _write(folder, _numbered(tracks(), names))
+        except WearcapError:  # a data set that is only read, or a full disk; or what the tracks are refused for
+            return joined(tracks(), names)
+    found: dict[str, Tensor] = {}
+    with understood(_APART, folder, fix=_FIX, errors=(OSError, LookupError, RuntimeError, TypeError, ValueError)):
+        for key, kind in read_tensors(folder / _INDEX, "packed data set", _FIX)[1].items():
+            path, shape = path_inside(folder, key, folder), kind.shape[1:]
+            if path.stat().st_size != (size := math.prod(shape)) * kind.itemsize:
+                raise ValueError(f"{key} is not of {shape[0]} rows")
+            found[key] = torch.from_file(str(path), shared=False, size=size, dtype=kind.dtype).reshape(shape)
+        length = found.pop("length")
+        whole, rows = Track.of(found), length.tolist()
+        if {len(value) for value in whole.values.values()} != {sum(rows)} or min(rows) < 1 or len(rows) != len(names):
+            raise ValueError(f"not of {len(names)} recordings")
+        _require_alike(whole, whole, str(folder))
+    return whole, length
+
+
+def _write(folder: Path, parts: Iterator[dict[str, Tensor]]) -> None:
+    """Write rows to a file of each kind as they come, and the index once all are there."""
+    index, files = dict[str, Tensor](), dict[str, BinaryIO]()
+    with ExitStack() as stack:
+        for key, value in (item for rows in parts for item in rows.items()):
+            if key not in files:
+                path = stack.enter_context(atomic_path(folder / key))
+                files[key], index[key] = stack.enter_context(open(path, "wb")), value[None, :0]
+            files[key].write(value.reshape(-1).view(torch.uint8).numpy())
+            index[key] = value.new_empty(0, index[key].shape[1] + len(value), *value.shape[1:])
+    write_tensors(folder / _INDEX, index)
+
+
+def kept_track(path: Path, make: Callable[[], Track]) -> Track:
+    """The track of a recording from a file of its data set's cache, made if it is missing; damaged ones are made anew."""
+    with suppress(WearcapError):
+        return Track.of(read_tensors(path, "packed recording")[1])
     track = make().packed()
     with suppress(WearcapError):  # a data set that is only read, or a full disk: the training needs no file
         write_tensors(path, track.flat())
     return track
 
 
-def forget_old(root: Path, key: str) -> None:
-    """Remove the files of all but `KEPT` packings of a data set: the one of a key, and those that were used last."""
-    with suppress(OSError):  # a data set that is only read
-        os.utime(root / "cache" / f"windows-{key}")
-    folders = sorted((root / "cache").glob("windows-*"), key=lambda folder: folder.stat().st_mtime, reverse=True)
-    for folder in folders[KEPT:]:
-        shutil.rmtree(folder, ignore_errors=True)
+def forget_old(used: Path) -> None:
+    """Remove all but `KEPT` folders of a kind ("windows-…"): the one in use, and those beside it that were used last."""
+    with suppress(OSError):  # a data set that is only read, or another process that removes them
+        os.utime(used)
+        folders = used.parent.glob(used.name.split("-")[0] + "-*")
+        for folder in sorted(folders, key=lambda folder: folder.stat().st_mtime, reverse=True)[KEPT:]:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def require_rows(values: dict[str, Any], where: str | Path) -> None:

@@ -5,9 +5,11 @@ holds; the augmentations of `transforms.py` stand between the two. Mean and scal
 split are computed of windows drawn from it, and saved with the weights.
 """
 
+import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,13 +18,15 @@ from jaxtyping import Float, Int64
 from rich.progress import track as progress
 from torch import Tensor
 
+from wearcap.boundary.texts import read_json_object
 from wearcap.data.arm_mixing import ArmDonors
 from wearcap.data.batch import Batch, Transform
 from wearcap.data.bodies import OtherBodies
 from wearcap.data.draws import Draws
-from wearcap.data.packing import Packed, Track, forget_old, kept_track
+from wearcap.data.packing import Packed, Track, forget_old, kept, kept_track
 from wearcap.data.transforms import Cutting, TimeStretch
 from wearcap.errors import WearcapError
+from wearcap.files import write_text
 from wearcap.models.layers import Normalizer
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
@@ -124,7 +128,7 @@ class Windows:
         stretch = max((each.factor for each in chosen if isinstance(each, TimeStretch)), default=1.0)
         stores = [RecordingStore.open(source.root) for source in sources]
         content.prepare(stores, split)
-        least, rows, found = content.min_frames(window, stretch), [], list[_Chosen]()
+        least, rows, found, cached = content.min_frames(window, stretch), [], list[_Chosen](), _Cached(content, stores)
         for source, store in zip(sources, stores):
             rate, entries = _rows(store, split, fps, every)
             entries = [(name, frames) for name, frames in entries if frames >= least * rate]
@@ -132,11 +136,13 @@ class Windows:
             power = balance if split == "train" else 1.0
             total = sum(count**power for count in counts)
             for (name, _), count in zip(entries, counts):
-                if content.usable(store, name):
+                usable, handled = cached.facts(store, name)
+                if usable:
                     step = 1 if content.own_rate else rate
                     rows += [(len(found), k * stride * step, step) for k in range(count)]
                     weight = source.weight * count ** (power - 1) / total
-                    found.append(_Chosen(store, name, rate, source.bodies, count, weight))
+                    varied = self.bodies is not None and source.bodies and not handled
+                    found.append(_Chosen(store, name, store.entries[name].sha256, rate, varied, count, weight))
         if not rows:
             what = f"no windows in split {split!r}"
             expected = f"recordings of at least {least} frames{content.requires}"
@@ -145,28 +151,19 @@ class Windows:
             raise WearcapError(f"recordings of {sorted(steps)} frames per frame of a window", expected="one rate")
         self.recordings, self.starts, self.step = found, torch.tensor(rows)[:, :2], rows[0][2]
         self.weights = torch.tensor([each.weight for each in found for _ in range(each.count)], dtype=torch.float64)
-        self._pack(found)
+        self._pack(found, cached)
 
-    def _pack(self, found: Sequence["_Chosen"]) -> None:
+    def _pack(self, found: Sequence["_Chosen"], cached: "_Cached") -> None:
         """Keep the recordings' tracks, and those of people who move others' arms."""
-        made = [(each, 0) for each in found]
-        varied = [self.bodies is not None and each.bodies and not _handled(each.file) for each in found]
+        made, varied = [(each, 0) for each in found], [each.varied for each in found]
         versions = torch.arange(len(found))[:, None]
         if self.bodies is not None and self.bodies.arms and any(varied):
             versions = versions.repeat(1, ARM_VERSIONS)
             mixed = torch.tensor(varied).nonzero()[:, 0]
             versions[mixed] = len(found) + torch.arange(len(mixed) * ARM_VERSIONS).reshape(-1, ARM_VERSIONS)
             made += [(found[each], version) for each in mixed.tolist() for version in range(1, ARM_VERSIONS + 1)]
-        kept = _Kept(self.content, [each for each, free in zip(found, varied) if free])
-        tracks = [kept(*each) for each in progress(made, "packing recordings", transient=True, disable=len(made) < 8)]
-        for root in {each.store.root for each in found}:
-            forget_old(root, kept.key)
-        if self.bodies is None:
-            tracks = [_of_wearer(track, self.content.parts) for track in tracks]
-        self.packed = Packed(tracks, [each.name for each, _ in made])
+        self.packed = cached.packed(made, summed=self.bodies is None)
         self.varied, self.versions = torch.tensor(varied), versions
-        twins = self.content.twins(found[0].file)
-        self.twins = {name: torch.tensor(order) for name, order in twins.items()}
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -174,7 +171,6 @@ class Windows:
     def to(self, device: torch.device) -> "Windows":
         """Draw on a device, which then holds all recordings."""
         self.packed.to(device)
-        self.twins = {name: order.to(device) for name, order in self.twins.items()}
         self.starts, self.weights = self.starts.to(device), self.weights.to(device)
         self.varied, self.versions = self.varied.to(device), self.versions.to(device)
         return self
@@ -192,7 +188,7 @@ class Windows:
             self.fps,
             stride=self.stride * self.step,
             step=self.step,
-            twins=self.twins,
+            twins=self.packed.twins,
             sensed=content.sensed,
             jumps=content.jumps,
             varied=self.varied[track],
@@ -217,8 +213,9 @@ class _Chosen:
 
     store: RecordingStore
     name: str
+    sha256: str
     rate: int
-    bodies: bool
+    varied: bool
     count: int
     weight: float
 
@@ -227,31 +224,57 @@ class _Chosen:
         return RecordingFile(self.store.path_of(self.name))
 
 
-class _Kept:
-    """Makes the tracks of recordings, or takes them from their data sets' caches."""
+class _Cached:
+    """What is made of recordings once, and kept in their data sets' caches."""
 
-    def __init__(self, content: Content, donors: list[_Chosen]):
-        """`donors`: recordings whose arms others may move, in their own data set."""
-        self.content, self.donors = content, donors
+    def __init__(self, content: Content, stores: Sequence[RecordingStore]):
         modules = [each.__module__ for each in type(content).__mro__ if each.__module__.startswith("wearcap.")]
-        self.key = digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
+        key = digest(type(content).__qualname__, content.settings(), code_digest(*modules))[:24]
+        self.content, self.folders = content, {each.root: each.root / "cache" / f"windows-{key}" for each in stores}
+        self._known, self._new = {root: dict[str, tuple[bool, bool]]() for root in self.folders}, set[Path]()
+        for root, folder in self.folders.items():
+            with suppress(WearcapError, TypeError, ValueError):  # none yet, or a damaged file
+                self._known[root] = {key: (a, b) for key, (a, b) in read_json_object(folder / "known.json").items()}
         self._arms = cache(self._arms_in)
 
-    def __call__(self, each: _Chosen, version: int) -> Track:
-        entries = each.store.entries
-        name = f"{entries[each.name].sha256[:32]}-{each.rate}"
-        if version:
-            others = [entries[other.name].sha256 for other in self.donors if other.store.root == each.store.root]
-            name += f"-{version}-{digest(others)[:16]}"
-        return kept_track(each.store.root, self.key, name, lambda: self._made(each, version))
+    def facts(self, store: RecordingStore, name: str) -> tuple[bool, bool]:
+        """Whether a recording is usable, and whether objects are handled in it, which other arms would not reach."""
+        facts, sha256 = self._known[store.root], store.entries[name].sha256
+        if sha256 not in facts:
+            handled = any(key.startswith("object_motion.") for key in RecordingFile(store.path_of(name)).keys)
+            facts[sha256] = self.content.usable(store, name), handled
+            self._new.add(store.root)
+        return facts[sha256]
+
+    def packed(self, made: Sequence[tuple[_Chosen, int]], summed: bool) -> Packed:
+        """Recordings and versions (not 0: with arms of others in their data set), `summed` over the body's parts or not."""
+        for root in self._new:
+            with suppress(WearcapError):  # a data set that is only read
+                write_text(self.folders[root] / "known.json", json.dumps(self._known[root]))
+        self.donors = [each for each, version in made if each.varied and not version]
+        group = cache(lambda root: digest([each.sha256 for each in self.donors if each.store.root == root])[:16])
+        names = [f"{each.sha256[:32]}-{each.rate}" + f"-{k}-{group(each.store.root)}" * (k > 0) for each, k in made]
+
+        def tracks() -> Iterator[Track]:
+            for each, name in zip(progress(made, "packing recordings", transient=True, disable=len(made) < 8), names):
+                path = self.folders[each[0].store.root] / f"{name}.safetensors"
+                track = kept_track(path, partial(self._made, *each))
+                yield _of_wearer(track, self.content.parts) if summed else track
+
+        whole = self.folders[made[0][0].store.root] / f"joined-{digest(names, summed)[:24]}"
+        packed = Packed(*kept(whole, tracks, [each.name for each, _ in made]))
+        for used in (whole, *self.folders.values()):
+            forget_old(used)
+        return packed
 
     def _made(self, each: _Chosen, version: int) -> Track:
-        recording = each.file.load()
+        recording = (file := each.file).load()
         if version and recording.motion is not None:
-            seed = int(each.store.entries[each.name].sha256[:8], 16) + version
-            mixed = self._arms(each.store.root).mixed(recording.motion, each.file, seed)
+            seed = int(each.sha256[:8], 16) + version
+            mixed = self._arms(each.store.root).mixed(recording.motion, file, seed)
             recording = replace(recording, motion=mixed)
-        return self.content.track(each.store, each.name, recording, each.rate)
+        twins = {name: torch.tensor(order) for name, order in self.content.twins(file).items()}
+        return replace(self.content.track(each.store, each.name, recording, each.rate), twins=twins)
 
     def _arms_in(self, root: Path) -> ArmDonors:
         donors = [each for each in self.donors if each.store.root == root]
@@ -265,12 +288,7 @@ def _of_wearer(track: Track, parts: frozenset[str]) -> Track:
         {name: value.sum(-2) if name in parts else value for name, value in each.items()}
         for each in (track.values, track.constants)
     )
-    return Track(values, constants, track.tables)
-
-
-def _handled(file: RecordingFile) -> bool:
-    """Whether objects are handled in a recording, which other arms would not reach."""
-    return any(key.startswith("object_motion.") for key in file.keys)
+    return replace(track, values=values, constants=constants)
 
 
 def _rows(store: RecordingStore, split: str, fps: float, every: int | None) -> tuple[int, list[tuple[str, int]]]:
