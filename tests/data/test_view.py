@@ -7,7 +7,7 @@ import torch
 
 from wearcap.data.batch import Batch
 from wearcap.data.draws import Draws
-from wearcap.data.packing import Packed, Track
+from wearcap.data.packing import Packed, Track, joined
 from wearcap.data.surroundings import HAND, hand_features
 from wearcap.data.view import HandsInView
 from wearcap.geometry import rotation
@@ -20,7 +20,7 @@ ALWAYS = {"everywhere": 0.0, "absent": 0.0, "least": 1.0, "down_deg": (0.0, 0.0)
 
 
 def batch() -> Batch:
-    track = Packed([Track({"floor_height": torch.zeros(FRAMES)})], ["r0"])
+    track = Packed(*joined([Track({"floor_height": torch.zeros(FRAMES)})], ["r0"]))
     none = torch.zeros(COUNT, dtype=torch.long)
     return Batch(track, Draws(torch.arange(COUNT)), none, none, FRAMES, FPS)
 

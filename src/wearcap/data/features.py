@@ -18,6 +18,16 @@ LIMBS = {
 """Measures of body size, each as the chain of joints whose bones add up to it."""
 
 
+SPREAD_M = 0.05
+"""Deviation (m) whose logarithm counts as 0."""
+_LOGARITHMS = -5.0, 3.0
+
+
+def deviations(logarithm: Float[Tensor, "*batch joint"]) -> Float[Tensor, "*batch joint"]:
+    """Standard deviations (m) along each axis of joints' positions relative to the head, as networks say them (ours)."""
+    return SPREAD_M * logarithm.clamp(*_LOGARITHMS).exp()
+
+
 def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:
     """`LIMBS` of a skeleton (m): height of the head joint in the rest pose, length of leg, arm and trunk."""
     lengths = [

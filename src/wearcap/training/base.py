@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import lightning
 import torch
+from jaxtyping import Float
 from lightning.pytorch.callbacks import Timer
 from torch import Tensor
 
@@ -79,6 +80,11 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
     def terms(self, batch: Any) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
         raise NotImplementedError
+
+    def away(self, batch: Any) -> Float[Tensor, "row joint axis"] | None:
+        """Errors of joints in a batch in the network's own deviations, before these were fitted (`callbacks.FitSpread`); None
+        of a network that says none. The logarithms of deviations are the last values of its normalised motion."""
+        return None
 
     def measure(self, batch: Any) -> dict[str, Tensor]:
         """The "loss" of a batch and further values to log."""

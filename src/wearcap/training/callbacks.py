@@ -203,3 +203,24 @@ class StepsProgressBar(RichProgressBar):
 
     def _get_train_description(self, current_epoch: int) -> str:
         return f"epoch {current_epoch}, steps"
+
+
+class FitSpread(Callback):
+    """Scales the joints' deviations after every validation epoch, so that 68 % of the errors are within them; the checkpoint
+    stores the logarithms of the factors as the deviations' mean.
+
+    It must come before the weight averaging in the list of callbacks: the factors belong to the averaged weights.
+    """
+
+    @torch.no_grad()
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        module: Any = pl_module
+        found = []
+        for batch in trainer.val_dataloaders or ():
+            away = module.away(module.transfer_batch_to_device(batch, module.device, 0))
+            if away is None:
+                return
+            found.append(away.movedim(1, 0).flatten(1))
+        if found:
+            factor = torch.cat(found, 1).quantile(0.6827, dim=1)
+            module.net.motion_normalizer.mean[-len(factor) :] = factor.clamp_min(0.1).log()

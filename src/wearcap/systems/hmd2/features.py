@@ -8,13 +8,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wearcap.body.skeleton import FEET
-from wearcap.data.features import LIMBS, first_repeated
+from wearcap.data.features import LIMBS, deviations, first_repeated
 from wearcap.errors import require_choice
 from wearcap.geometry import rotation
-
-SPREAD_M = 0.05
-"""Deviation (m) whose logarithm counts as 0."""
-_LOGARITHMS = -5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -117,5 +113,5 @@ class HeadFeatures:
         return torch.cat([R_root[:, :, None], R[:, :, 1:]], 2), contact.clamp(0, 1)
 
     def joint_std(self, motion: Float[Tensor, "batch time motion"]) -> Float[Tensor, "batch time deviation"]:
-        """Standard deviation (m) along each axis of every joint's position relative to the head; none without `spread`."""
-        return SPREAD_M * motion[..., self.pose_size :].clamp(*_LOGARITHMS).exp()
+        """`deviations` of every joint; none without `spread`."""
+        return deviations(motion[..., self.pose_size :])

@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from einops import rearrange
-from lightning.pytorch import Callback, Trainer
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -162,6 +161,17 @@ class MotionDiffusion(Training):
         with losses.exact(x0):
             return self._errors(x0_hat.float(), x0, batch)
 
+    def away(self, batch: HeadWindow) -> Tensor | None:
+        """Of one step from noise, which gives the mean."""
+        if not self.features.spread:
+            return None
+        batch = batch._replace(level=torch.ones_like(batch.level))
+        motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+        x0_hat = self._predicted(batch, self.net.motion_normalizer(motion)).float()
+        R_hat, _ = self.features.decode(self.net.motion_normalizer.inverse(x0_hat), batch.R_world_head)
+        found, true = (batch.joints_from_head(self.skeleton, R) for R in (R_hat, batch.R_parent_joint))
+        return ((found - true).abs() / self.features.joint_std(x0_hat)[..., None])[batch.valid]
+
     def _errors(self, x0_hat: Tensor, x0: Tensor, batch: HeadWindow) -> dict[str, Tensor]:
         valid = batch.valid  # padding weighs nothing
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
@@ -188,33 +198,6 @@ class MotionDiffusion(Training):
                     logit, batch.foot_contact, self.loss.contact_share, weight
                 )
         return terms
-
-
-class FitSpread(Callback):
-    """Scales the joints' deviations after every validation epoch, so that 68 % of the errors of one step from noise are within
-    them; the checkpoint stores the factors as the mean of the deviations' logarithms.
-
-    It must come before the weight averaging in the list of callbacks: the factors belong to the averaged weights.
-    """
-
-    @torch.no_grad()
-    def on_validation_epoch_end(self, trainer: Trainer, pl_module: MotionDiffusion) -> None:
-        features, net = pl_module.features, pl_module.net
-        loader = trainer.val_dataloaders
-        if not features.spread or loader is None:
-            return
-        shares = []
-        for batch in loader:
-            batch = pl_module.transfer_batch_to_device(batch, pl_module.device, 0)
-            batch = batch._replace(level=torch.ones_like(batch.level))
-            motion = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
-            x0_hat = pl_module._predicted(batch, net.motion_normalizer(motion)).float()
-            R_hat, _ = features.decode(net.motion_normalizer.inverse(x0_hat), batch.R_world_head)
-            found, true = (batch.joints_from_head(pl_module.skeleton, R) for R in (R_hat, batch.R_parent_joint))
-            away = (found - true).abs() / features.joint_std(x0_hat)[..., None]
-            shares.append(away[batch.valid].movedim(1, 0).flatten(1))
-        factor = torch.cat(shares, 1).quantile(0.6827, dim=1)
-        net.motion_normalizer.mean[features.pose_size :] = factor.clamp_min(0.1).log()
 
 
 def feature_statistics(

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FOOT_JOINTS, MIRROR, WRISTS, Skeleton
@@ -93,6 +94,8 @@ class WatchFeatures:
     """watches: orientation and acceleration. positions: orientation and position (three-point tracking)."""
     body: bool = False
     """Whether the wearer's body size is an input (ours; the paper uses a mean body)."""
+    spread: bool = False
+    """Whether the logarithm of every joint's standard deviation is among the outputs (ours)."""
     joints: int = 23
     fps: float = 30.0
 
@@ -111,7 +114,11 @@ class WatchFeatures:
 
     @property
     def motion_size(self) -> int:
-        """Number of output features: root translation, and 6D rotations of all joints."""
+        """Number of output features: root translation, 6D rotations of all joints, and with `spread` their deviations."""
+        return self.pose_size + (self.joints if self.spread else 0)
+
+    @property
+    def pose_size(self) -> int:
         return 3 + 6 * self.joints
 
     def canonical(self, sensed: Sensed, floor_height: Float[Tensor, "batch time"]) -> Rigid:
@@ -166,18 +173,20 @@ class WatchFeatures:
         sensed: Sensed,
         canonical: Rigid,
     ) -> Float[Tensor, "batch time motion"]:
-        """Target features: root translation and local rotations, with the root's pose in the canonical frame."""
+        """Target features: root translation and local rotations, with the root's pose in the canonical frame; zeros in the
+        places of deviations."""
         R, t = canonical.R, canonical.t
         root = (R.mT @ (t_world_root - t)[..., None])[..., 0] - self.origin(sensed, canonical)
         turned = torch.cat([(R.mT @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)
-        return torch.cat([root, rotation.rot6d_from_matrix(turned).flatten(-2)], -1)
+        motion = torch.cat([root, rotation.rot6d_from_matrix(turned).flatten(-2)], -1)
+        return F.pad(motion, (0, self.motion_size - self.pose_size))
 
     def decode_motion(
         self, motion: Float[Tensor, "batch predicted motion"], sensed: Sensed, canonical: Rigid
     ) -> tuple[Float[Tensor, "batch predicted joint 3 3"], Float[Tensor, "batch predicted 3"]]:
         """Local rotations and root translation (m) of the window's last frames, in the world."""
         count = motion.shape[1]
-        R_parent_joint = rotation.matrix_from_rot6d(motion[..., 3:].unflatten(-1, (-1, 6)))
+        R_parent_joint = rotation.matrix_from_rot6d(motion[..., 3 : self.pose_size].unflatten(-1, (-1, 6)))
         t_root = motion[..., :3] + self.origin(sensed, canonical)[:, -count:]
         R, t = canonical.R[:, -count:], canonical.t[:, -count:]
         turned = torch.cat([(R @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)

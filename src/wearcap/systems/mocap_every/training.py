@@ -9,6 +9,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
+from wearcap.data.features import deviations
 from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
@@ -24,7 +25,8 @@ class WatchRegression(Training):
 
     Loss terms, weighted by `loss_weights`, are means over frames and joints: "root" and "rotation" (eq. 2), "position"
     with `joint_weights` for hands and feet (eq. 3), "mid" and "consistency" of the first stage (eq. 4), "contact"
-    (cross entropy), "foot_velocity"; "velocity" of all joints and "skate" of feet in contact are ours.
+    (cross entropy), "foot_velocity"; "velocity" of all joints, "skate" of feet in contact and "spread" of the joints'
+    deviations, whose errors teach nothing else, are ours.
     """
 
     _joint_weights: Tensor
@@ -66,6 +68,7 @@ class WatchRegression(Training):
         ends = self.ends_from_world(self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical)
         standardize(self.net.feature_normalizer, features)
         standardize(self.net.motion_normalizer, motion)
+        self.net.motion_normalizer.scale[self.features.pose_size :] = 1.0
         standardize(self.net.ends_normalizer, rearrange(ends, "batch time end xyz -> batch time (end xyz)"))
 
     def _inputs(
@@ -98,12 +101,34 @@ class WatchRegression(Training):
         with losses.exact(batch.t_world_root):
             return self._errors(output, true, canonical, batch)
 
+    @property
+    def _fitted(self) -> Tensor:
+        """What `FitSpread` added to the deviations' logarithms."""
+        return self.net.motion_normalizer.mean[self.features.pose_size :]
+
+    def _from_head(
+        self, joints: Float[Tensor, "batch time joint 3"], true: Float[Tensor, "batch time joint 3"]
+    ) -> Float[Tensor, "batch time joint 3"]:
+        """Errors (m) of joints relative to the head, where captures are anchored."""
+        head, error = self.skeleton.index("head"), joints - true
+        return error - error[:, :, head, None]
+
+    def away(self, batch: WatchWindow) -> Tensor | None:
+        if not self.features.spread:
+            return None
+        features, true, canonical = self._inputs(batch)
+        motion = self.net(features).motion.float()
+        std = deviations(motion[..., self.features.pose_size :] - self._fitted)
+        joints, joints_true = (self._joints(each, batch, canonical) for each in (motion, true[:, -motion.shape[1] :]))
+        return (self._from_head(joints, joints_true).abs() / std[..., None]).flatten(0, 1)
+
     def _errors(self, output: Estimate, true: Tensor, canonical: Rigid, batch: WatchWindow) -> dict[str, Tensor]:
         last = output.motion.shape[1]
         motion, true, contact = output.motion.float(), true[:, -last:], batch.foot_contact[:, -last:]
         every = torch.ones_like(contact[..., 0])
         joints, joints_true = (self._joints(each, batch, canonical) for each in (motion, true))
-        error = motion - true
+        pose = slice(self.features.pose_size)
+        error = motion[..., pose] - true[..., pose]
         rotation_error = _norm(rearrange(error[..., 3:], "batch time (joint entry) -> batch time joint entry", entry=6))
         distance = _norm(joints - joints_true)
         terms = {
@@ -112,6 +137,9 @@ class WatchRegression(Training):
             "position": (distance * self._joint_weights).mean(),
             "contact": losses.balanced_cross_entropy(output.contact_logit.float(), contact, self.contact_share, every),
         }
+        if self.features.spread:
+            std = deviations(motion[..., self.features.pose_size :] - self._fitted)
+            terms["spread"] = losses.surprise(self._from_head(joints, joints_true).detach(), std, every)
         if last > 1:
             feet = joints[:, :, self._feet].unflatten(2, (2, 2))
             terms["skate"] = losses.foot_skate(feet, contact, every, self.fps)

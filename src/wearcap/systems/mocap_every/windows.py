@@ -11,9 +11,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import FOOT_JOINTS, MIRROR, Skeleton
-from wearcap.data.features import body_size
-from wearcap.data.transforms import mirrored_rotations
+from wearcap.body.skeleton import FEET, FOOT_JOINTS, MIRROR, Skeleton
+from wearcap.data.features import body_size, deviations
+from wearcap.data.transforms import joint_twins, mirrored_rotations
 from wearcap.geometry import rotation
 from wearcap.runtime.windows import StretchWindows, moved_on
 from wearcap.scene.floor import FloorFixed, FloorFollower
@@ -50,8 +50,9 @@ class EstimatorWindows(StretchWindows[Frames]):
         self._feet = skeleton.indices(*FOOT_JOINTS)
         position = torch.arange(1, length + 1, dtype=torch.float32)
         self._weight = torch.minimum(position, length + 1 - position).square()[:, None]
-        self._sum = torch.zeros(1, length, 3 + 6 * len(skeleton) + 3)
-        """Weighted sums of the predictions for the window's frames (root, rotations, contact), and sums of weights."""
+        joints, spread = len(skeleton), pipeline.model.features.spread
+        self._sum = torch.zeros(1, length, 3 + 6 * joints + FEET + (joints if spread else 0) + 1)
+        """Weighted sums of the predictions for the window's frames (`_parts`), and sums of weights."""
         self.points: list[tuple[Tensor, Tensor]] = []
         """Points (m) that the floor follower does not have yet, and the times (s) they were first seen."""
 
@@ -89,12 +90,12 @@ class EstimatorWindows(StretchWindows[Frames]):
         last = len(output)
         self._sum = moved_on(self._sum, count, length)
         self._sum[0, -last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
-        R, t, contact = _parts(output[-count:])
+        R, t, contact, _ = _parts(output[-count:], len(self._skeleton))
         self._floor.follow(contact, forward_kinematics(self._skeleton, R, t).t[:, self._feet])
         self.emit(self._pipeline.overlap.lookahead)
 
     def _estimated(self) -> Float[Tensor, "last value"]:
-        """Root, 6D rotations and contact of the window's last frames, in the world."""
+        """Root, 6D rotations, contact and deviations of the window's last frames, in the world."""
         frames, mirrors = self.frames, self._pipeline.overlap.mirror_average
         assert frames is not None
         features, floor, size, sensed = (
@@ -110,11 +111,14 @@ class EstimatorWindows(StretchWindows[Frames]):
         estimated = self._pipeline.estimate(features.encode(sensed, floor, size, canonical))
         R, t = features.decode_motion(estimated.motion.float(), sensed, canonical)
         contact = estimated.contact_logit.float().sigmoid()
+        std = deviations(estimated.motion[..., features.pose_size :].float())
         if mirrors:
             R = torch.stack([R[0], mirrored_rotations(R[1], self._skeleton)])
             t = torch.stack([t[0], t[1] * t.new_tensor(MIRROR)])
             contact = torch.stack([contact[0], contact[1].flip(-1)])
-        return torch.cat([t, rotation.rot6d_from_matrix(R).flatten(-2), contact], -1).mean(0)
+            if features.spread:
+                std = torch.stack([std[0], std[1][:, joint_twins(self._skeleton)]])
+        return torch.cat([t, rotation.rot6d_from_matrix(R).flatten(-2), contact, std], -1).mean(0)
 
     @property
     def floor_m(self) -> float:
@@ -124,11 +128,17 @@ class EstimatorWindows(StretchWindows[Frames]):
 
     def _poses(self, part: slice) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         rows = self._sum[0, part]
-        return *_parts(rows[:, :-1] / rows[:, -1:]), rows[:, :0]
+        return _parts(rows[:, :-1] / rows[:, -1:], len(self._skeleton))
 
 
 def _parts(
-    output: Float[Tensor, "time value"],
-) -> tuple[Float[Tensor, "time joint 3 3"], Float[Tensor, "time 3"], Float[Tensor, "time foot"]]:
-    """Rotations, root and contact of a prediction."""
-    return rotation.matrix_from_rot6d(output[:, 3:-2].unflatten(-1, (-1, 6))), output[:, :3], output[:, -2:]
+    output: Float[Tensor, "time value"], joints: int
+) -> tuple[
+    Float[Tensor, "time joint 3 3"],
+    Float[Tensor, "time 3"],
+    Float[Tensor, "time foot"],
+    Float[Tensor, "time deviation"],
+]:
+    """Rotations, root, contact and deviations, if there are any, of a prediction."""
+    root, turned, contact, std = output.split([3, 6 * joints, FEET, output.shape[1] - 3 - 6 * joints - FEET], -1)
+    return rotation.matrix_from_rot6d(turned.unflatten(-1, (-1, 6))), root, contact, std
