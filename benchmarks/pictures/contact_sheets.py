@@ -41,6 +41,7 @@ from wearcap.reading import load
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, System
+from wearcap.runtime.walked_stature import with_walked_stature
 from wearcap.scene.floor import estimate_floor
 from wearcap.tracking.stature import with_stature
 
@@ -87,7 +88,9 @@ def walk(pipeline: System, file: Path) -> tuple[np.ndarray, dict[str, float]]:
     """Cycles of a recorded walk from the side, "height width 3", and its figures. Raises WearcapError where the capture
     does not walk."""
     recording, stature = with_stature(load(file).recording, xsens23())
-    motion = pipeline(CaptureInput.in_dataset(recording, dataset_folder(file)))
+    source = CaptureInput.in_dataset(recording, dataset_folder(file))
+    source, stature = with_walked_stature(pipeline, source, stature, xsens23())
+    recording, motion = source.recording, pipeline(source)
     both = cycle_times(motion)
     cycles, knees = torch.cat(both), torch.cat(knees_over(motion, both))[:, STANCE].mean(1)
     if not len(cycles):

@@ -37,10 +37,12 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.saving import on_skeleton, write_smplh
+from wearcap.metrics.gait import crouches
 from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, dataset_folder
-from wearcap.runtime.system import CaptureInput, StageOptions, System
+from wearcap.runtime.system import CaptureInput, LearnedSystem, StageOptions, System
+from wearcap.runtime.walked_stature import with_walked_stature
 from wearcap.tracking.stature import skeleton_of, with_stature
 
 
@@ -65,20 +67,8 @@ def captured(config: Any, system: System) -> Motion | None:
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     filmed_s = _filmed_s(config.video)
-    body = None if config.skeleton is None else skeleton_of(read(config.skeleton))
-    how = stated(config if isinstance(config, DictConfig) else vars(config))
-    loaded = load(config.recording, how)
-    if config.check:  # a scene that is given stands in for the recording's own
-        require_sound(
-            loaded.recording, [found for found in loaded.findings if not (config.scene and found.check == SCAN_FILE)]
-        )
-    recording, stature = with_stature(loaded.recording, xsens23(), config.height, body)
-    dataset = dataset_folder(config.recording)
-    if recording.note and not (dataset / MANIFEST).is_file():
-        show(f"read: {escape(recording.note)}")
-    if stature.source != "skeleton":
-        show(f"height: {stature}" if stature.known else f"{stature}: give height=… (m)")
-    source = CaptureInput.in_dataset(recording, dataset, config.scene, config.metres_per_unit)
+    source = _input(config, system)
+    recording = source.recording
     seeds = range(config.seed, config.seed + (config.samples if system.draws else 1))
     cache = None if config.cache is None else Path(config.cache)
     options = StageOptions(cache, config.until, Console(stderr=True))
@@ -93,6 +83,10 @@ def captured(config: Any, system: System) -> Motion | None:
         if recording.origin is not None:
             motion.provenance.update(origin=" ".join(map(str, recording.origin.tolist())))
         _write(motion, recording, folder, config)
+        if (knee_deg := crouches(motion)) is not None:
+            show(
+                f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"
+            )
         environment = None if motion.object_motion is None else system.objects(source)
         truth = with_objects(recording, environment)
         shown = {} if truth is None else {"truth": truth}
@@ -108,6 +102,30 @@ def captured(config: Any, system: System) -> Motion | None:
             shown |= {"capture": motion}
             write_video(folder / "motion.mp4", shown, body=body, environment=environment, max_seconds=filmed_s)
     return motion
+
+
+def _input(config: Any, system: System) -> CaptureInput:
+    """The recording with its files and the wearer's height, with a line on each of both."""
+    body = None if config.skeleton is None else skeleton_of(read(config.skeleton))
+    how = stated(config if isinstance(config, DictConfig) else vars(config))
+    loaded = load(config.recording, how)
+    if config.check:  # a scene that is given stands in for the recording's own
+        require_sound(
+            loaded.recording, [found for found in loaded.findings if not (config.scene and found.check == SCAN_FILE)]
+        )
+    recording, stature = with_stature(loaded.recording, xsens23(), config.height, body)
+    dataset = dataset_folder(config.recording)
+    if recording.note and not (dataset / MANIFEST).is_file():
+        show(f"read: {escape(recording.note)}")
+    if stature.source != "skeleton":
+        show(f"height: {stature}" if stature.known else f"{stature}: give height=… (m)")
+    source = CaptureInput.in_dataset(recording, dataset, config.scene, config.metres_per_unit)
+    if not isinstance(system, LearnedSystem):
+        return source
+    source, walked = with_walked_stature(system, source, stature, xsens23())
+    if walked != stature:
+        show(f"height: {walked}")
+    return source
 
 
 def _write(motion: Motion, recording: Recording, folder: Path, config: Any) -> None:

@@ -25,6 +25,8 @@ _KNEE = ((0, 5, 12, 20, 30, 40, 50, 60, 70, 73, 80, 90, 97, 100), (5, 11, 18, 15
 _CYCLE_S = (0.7, 1.7)
 _PEAK_DEG = 30.0
 """Least flexion of a swing's peak, also of people who hardly lift their feet."""
+CROUCHED_DEG = 25.0
+"""Flexion in stance from which somebody walks crouching."""
 SEATED_DEG = 60.0
 """Flexion from which somebody upright who keeps still sits or squats."""
 _LEVEL_M = 0.08
@@ -89,6 +91,12 @@ def walking_scores(motion: Motion, cycles: list[Float64[Tensor, "_ point"]]) -> 
         return {}
     off = (curves.mean(0) - normal_knee_deg()).square().mean().sqrt()
     return {"stance_knee_deg": curves[:, STANCE].mean(1).median().item(), "knee_curve_rms_deg": off.item()}
+
+
+def crouches(motion: Motion) -> float | None:
+    """The median knee in stance (degrees) of a motion that walks on knees more bent than people's; None of others."""
+    knee_deg = walking_scores(motion, cycle_times(motion)).get("stance_knee_deg", 0.0)
+    return knee_deg if knee_deg > CROUCHED_DEG else None
 
 
 def standing(motion: Motion) -> Bool[Tensor, "time"]:

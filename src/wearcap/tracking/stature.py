@@ -44,7 +44,7 @@ class Stature:
     deviation_m: float
     """Expected error (m); 0 for a height that was given."""
     source: str
-    """"given", "skeleton" or "head", or a key of `UNKNOWN`."""
+    """"given", "skeleton", "head" or "walk", or a key of `UNKNOWN`."""
 
     @property
     def known(self) -> bool:
@@ -56,6 +56,8 @@ class Stature:
         if self.source == "head":
             small = "; a child, or somebody who sits?" if self.height_m < SEATED_M[1] else ""
             return f"{self.height_m:.2f} ± {self.deviation_m:.2f} m, from how high the head is carried{small}"
+        if self.source == "walk":
+            return f"{self.height_m:.2f} ± {self.deviation_m:.2f} m, from how high the head is carried and how knees bear weight"
         return f"{self.height_m:.2f} m, {'as given' if self.source == 'given' else 'of its skeleton'}"
 
 
