@@ -467,8 +467,8 @@ def _limits(
     fid, paper = PAPER_METRICS.index("fid"), PAPER["HMD² (h = 180)"]
     ours, rival, hands = BRIEF, "EgoEgo-style, its mean", "AvatarPoser-style (head and hands)"
     return (
-        "A real walk with Aria glasses is captured crouching: its knees stay bent "
-        "([the card](../../checkpoints/hmd2.md) has the angles). Why is not known.",
+        "A real walk with Aria glasses has knees more bent than people's "
+        "([the card](../../checkpoints/hmd2.md) has the angles).",
         f"On HDM05's person HMD² has no lead over the EgoEgo-style rival of equal budget ({error(strangers, ours)} against "
         f"{error(strangers, rival)} cm; the shared checkpoint, which learned longer, {error(strangers, ALONE)}). On CMU it has: "
         f"{error(real, ours)} against {error(real, rival)} cm.",

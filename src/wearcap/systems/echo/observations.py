@@ -33,6 +33,9 @@ SWAPPED_M = 0.02
 """Median distance of the left wrist to the right of the right wrist from which the two count as swapped (m)."""
 
 
+_GAPS = "checkpoint=echo_gaps knows wrists that come and go."
+
+
 @dataclass(frozen=True, eq=False)
 class Observed:
     """Sparse observations of the output modalities, each at its own times (ECHO §4.2)."""
@@ -99,7 +102,7 @@ def _tracked_points(
     poses, truth = [path.T_world_head], recording.motion
     if len(found) == 1 and not gaps:
         expected = f"`tracked` poses of {' and '.join(WRISTS)}"
-        raise WearcapError(f"only {found[0]} is tracked", where=where, expected=expected)
+        raise WearcapError(f"only {found[0]} is tracked", where=where, expected=expected, fix=_GAPS)
     if found:
         for number, joint in enumerate(WRISTS, 1):
             track = recording.tracked.get(joint)
@@ -154,7 +157,9 @@ def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, w
     late, early = times[0] - path.timestamps[0], path.timestamps[-1] - times[-1]
     if not gaps and max(late.item(), early.item()) > 0.5:
         expected = f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head"
-        raise WearcapError(f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where, expected=expected)
+        raise WearcapError(
+            f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where, expected=expected, fix=_GAPS
+        )
 
 
 def _active_objects(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> ActiveObjects:
