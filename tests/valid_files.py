@@ -45,7 +45,8 @@ from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.boundary import arrays, pickles, texts  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
-from wearcap.io.devices import aria_mps, headset_log, headset_tables, watch_log  # noqa: E402
+from wearcap.geometry.trajectory import Trajectory  # noqa: E402
+from wearcap.io.devices import aria_hands, aria_mps, headset_log, headset_tables, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     amass,
     asf_amc,
@@ -188,6 +189,29 @@ def _mps(folder: Path) -> None:
     (slam / "semidense_points.csv.gz").write_bytes(gzip.compress(POINTS.encode(), mtime=0))
 
 
+def _hands(folder: Path) -> None:
+    columns = [
+        f"{part}_{{}}_{place}"
+        for place in ("wrist_device", "palm_device")
+        for part in ("tx", "ty", "tz", "nx", "ny", "nz")
+    ]
+    names = [f"{side}_tracking_confidence" for side in ("left", "right")]
+    names += [name.format(side) for side in ("left", "right") for name in columns]
+    rows = []
+    for k in range(12):
+        places = ["0.1", "0.2", "0.3", "0", "0", "1", "0.18", "0.2", "0.3", "0", "0", "1"]
+        rows.append(",".join([str(10_000_000 + 33_333 * k), "0.9", "0.9", *places, *places]))
+    (folder / "wrist_and_palm_poses.csv").write_text(
+        "\n".join([",".join(["tracking_timestamp_us", *names]), *rows]) + "\n"
+    )
+
+
+def _read_hands(folder: Path):
+    times = torch.tensor([9.0, 12.0], dtype=torch.float64)
+    head = Trajectory(times, torch.eye(3).repeat(2, 1, 1), torch.zeros(2, 3))
+    return aria_hands.read_hands([folder / "wrist_and_palm_poses.csv"], head)
+
+
 def _adt_objects(folder: Path) -> None:
     (folder / "scene_objects.csv").write_text(
         "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m],q_wo_w,q_wo_x,q_wo_y,q_wo_z\n"
@@ -302,6 +326,7 @@ READERS: dict[str, Reader] = {
     ),
     "aria_points": one("a.csv.gz", gzip.compress(POINTS.encode(), mtime=0), aria_mps.read_points),
     "aria_mps": Reader(_mps, aria_mps.read_mps),
+    "aria_hands": Reader(_hands, _read_hands),
     "asf": one("a.asf", test_asf_amc.ASF, asf_amc.read_asf),
     "amc": Reader(
         lambda folder: test_asf_amc.write(folder, amc=test_asf_amc.amc_text(4)),

@@ -17,9 +17,21 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.metrics.gait import STANCE, normal_knee_deg
 from wearcap.recording import PointCloud, RecordingStore
 from wearcap.recording.motion import Motion
+from wearcap.runtime.system import Captured, System
 from wearcap_testing import recording_of
 
 FLOOR_M = 0.4
+
+
+class Walks(System):
+    """A system that captures the same motion of everybody."""
+
+    def __init__(self, motion: Motion):
+        self.motion, self.seen = motion, []
+
+    def capture(self, recordings, seeds, options=None):
+        self.seen += [source.recording for source in recordings]
+        return [Captured(self.motion) for _ in recordings]
 
 
 @pytest.fixture
@@ -49,13 +61,13 @@ def recorded(walker, tmp_path) -> Path:
 
 
 def test_a_walk_is_drawn_and_measured(sheets, walker, recorded, tmp_path, monkeypatch, capsys):
-    seen = []
-    monkeypatch.setattr(sheets, "load_pipeline", lambda *_: lambda source: seen.append(source.recording) or walker)
+    system = Walks(walker)
+    monkeypatch.setattr(sheets, "load_pipeline", lambda *_: system)
     sheets.main(["hmd2", "--walk", str(recorded), "--output", str(tmp_path)])
     figures = json.loads((tmp_path / "hmd2_somebody.json").read_text())
     assert json.loads(capsys.readouterr().out) == figures
-    assert seen[0].motion is None
-    assert figures["stature_m"] == pytest.approx(seen[0].skeleton.stature, abs=1e-3)
+    assert system.seen[-1].motion is None
+    assert figures["stature_m"] == pytest.approx(system.seen[-1].skeleton.stature, abs=1e-3)
     assert figures["cycles"] >= 6
     assert figures["stance_knee_deg"] == pytest.approx(normal_knee_deg()[STANCE].mean().item() + 12, abs=1)
     sites = [walker.skeleton.sites[f"{side}_toe_tip"] for side in ("left", "right")]
@@ -70,4 +82,4 @@ def test_a_walk_is_drawn_and_measured(sheets, walker, recorded, tmp_path, monkey
 def test_who_stands_has_no_sheet(sheets, walker, recorded):
     still = replace(walker, t_world_root=walker.t_world_root[:1].expand(len(walker), 3))
     with pytest.raises(WearcapError, match="no cycle of straight, level walking"):
-        sheets.walk(lambda _: still, recorded)
+        sheets.walk(Walks(still), recorded)

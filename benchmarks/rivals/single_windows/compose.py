@@ -1,5 +1,6 @@
 """The data of an experiment of today, drawn as before: the same config with other classes."""
 
+import math
 from dataclasses import fields
 from typing import Any
 
@@ -66,6 +67,12 @@ def _settings_before(part: dict[str, Any], name: str) -> dict[str, Any]:
     """A class's settings as they were before."""
     if name == "Loading":
         return {key: part[key] for key in ("_target_", *(field.name for field in fields(Loading))) if key in part}
+    if name == "SensorErrors":  # of all axes alike
+        alike = {key: value for key, value in part.items() if isinstance(value, list)}
+        return part | {key: math.hypot(*value) / len(value) ** 0.5 for key, value in alike.items()}
+    if name in ("HeadContent", "EchoContent"):  # hands that come and go were not drawn
+        part.get("conditions", {}).pop("hands", None)
+        return {key: value for key, value in part.items() if key != "view"}
     if name == "OtherBodies" and "count" not in part:
         share = part.pop("share", OTHERS)
         return part | {"count": round(share / (1 - share))}
