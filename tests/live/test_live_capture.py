@@ -43,6 +43,7 @@ from wearcap.apps.live.wearer import LiveWearer
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.layers import TransformerSize
 from wearcap.recording import Motion, Recording
@@ -77,11 +78,17 @@ class Kept(Sink):
         return whole
 
 
-def small_hmd2(**changes):
+def small_hmd2(hands: bool = False, **changes):
     torch.manual_seed(0)
     features = HeadFeatures(contacts=True, body=True)
     net = MotionDenoiser(
-        features.motion_size, features.condition_size, 60, TransformerSize(32, 1, 4, 64, 0.0), 4, blend=5
+        features.motion_size,
+        features.condition_size,
+        60,
+        TransformerSize(32, 1, 4, 64, 0.0),
+        4,
+        conditions={"hands": 20} if hands else {},
+        blend=5,
     )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
@@ -97,6 +104,16 @@ def swaying(frames: int = 200) -> Recording:
     return recording_of(swaying_motion(frames, 0), "sway")
 
 
+def waving(frames: int = 200) -> Recording:
+    """The right hand is tracked, but in the middle."""
+    recording = swaying(frames)
+    assert recording.motion is not None
+    hand = recording.motion.joint("right_wrist")
+    seen = torch.cat([torch.arange(60), torch.arange(120, frames)])
+    track = Trajectory(recording.motion.timestamps[seen], hand.R[seen], hand.t[seen])
+    return replace(recording, tracked={"right_wrist": track})
+
+
 def carried() -> Recording:
     return replace(carrying(1.2), object_motion={}, interactions=None, environment=None)
 
@@ -110,7 +127,8 @@ def replayed(system, recording: Recording, *sinks: Sink, speed: float = math.inf
 
 
 @pytest.mark.parametrize(
-    ("system", "recording"), [(drawn_pipeline, watched), (small_hmd2, swaying), (drawn_echo, carried)]
+    ("system", "recording"),
+    [(drawn_pipeline, watched), (small_hmd2, swaying), (lambda: small_hmd2(hands=True), waving), (drawn_echo, carried)],
 )
 def test_a_replay_gives_the_offline_capture(system, recording):
     made, sensed = system(), recording()

@@ -29,6 +29,8 @@ class Session:
 
     devices: ClassVar[tuple[str, ...]] = ("head",)
     """Devices of a wearer without which there is no motion: "head", joints of wrists, "suit", "camera"."""
+    optional: ClassVar[tuple[str, ...]] = ()
+    """Devices that are taken where they come, and whenever they do."""
     tracks_wrists: ClassVar[bool] = False
     """Whether wrists come as tracked poses; otherwise as orientation and acceleration of watches."""
     given_floor: ClassVar[bool] = False

@@ -17,7 +17,7 @@ import torch
 
 from wearcap.apps.live.packets import HEAD, Inbox, Packet
 from wearcap.apps.live.recent import Recent
-from wearcap.apps.live.setup import Known, Setup, write_setup
+from wearcap.apps.live.setup import Known, Setup, hand_seat, write_setup
 from wearcap.apps.live.setup_estimation import SetupEstimation
 from wearcap.apps.live.sink import Sink, SinkThread
 from wearcap.apps.live.sinks.files import FilesSink
@@ -106,6 +106,7 @@ class LiveCapture:
         self.opener = Opener(
             lambda wearer: kind.of_wearers(system, [wearer], seed, source),
             kind.devices,
+            {joint: hand_seat(joint, self.known.hands) for joint in kind.optional},
             kind.tracks_wrists,
             kind.takes_objects,
             self._estimation,

@@ -14,7 +14,7 @@ from wearcap.apps.live.clocks import Clocks
 from wearcap.apps.live.devices import MAX_DEVICES, Device
 from wearcap.apps.live.packets import HEAD, SUIT, Packet
 from wearcap.apps.live.recent import Recent
-from wearcap.apps.live.setup import Setup
+from wearcap.apps.live.setup import Seat, Setup
 from wearcap.apps.live.setup_estimation import SetupEstimation
 from wearcap.apps.live.status import MAX_POINTS, Counts, Latencies, Stage, WearerStatus
 from wearcap.body.skeleton import Skeleton
@@ -55,6 +55,8 @@ class Opener:
     session: Callable[[Wearer], Session]
     devices: tuple[str, ...]
     """Devices that the session needs; the first one's clock times the motion."""
+    hands: dict[str, Seat]
+    """Nominal seats of wrists that the session takes where they come, without a set-up that knows them."""
     tracks_wrists: bool
     takes_objects: bool
     estimation: Callable[[Setup | None, bool], SetupEstimation]
@@ -257,7 +259,7 @@ class LiveWearer:
     def _seated(self, device: str, sample: Any) -> Any:
         """A device's sample as the session takes it, on the joint that wears it; None for a device that nobody wears."""
         assert self.setup is not None
-        seat = self.setup.seats.get(device)
+        seat = self.setup.seats.get(device, self.opener.hands.get(device))
         match sample:
             case HeadSample():
                 floor_m = self.setup.floor_m if sample.floor_height is None else sample.floor_height

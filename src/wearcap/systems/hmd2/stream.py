@@ -113,6 +113,9 @@ class HMD2Session(Session):
     When a wearer's clock is reset, that wearer's capture restarts as in a new session.
     """
 
+    optional = WRISTS
+    tracks_wrists = True
+
     def __init__(self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None):
         """Raises WearcapError when there is not one seed per wearer, or for a stride or lookahead that does not fit."""
         if len(wearers) != len(seeds) or not wearers:

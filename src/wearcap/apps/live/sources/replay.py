@@ -63,7 +63,8 @@ class ReplaySource(Source):
             raise WearcapError(f"speed={speed}", expected="a positive number, or inf: as fast as it goes")
         self.recording, self.kind, self.speed, self.wearer = recording, kind, speed, wearer
         self.objects = list(objects)
-        self.streams = {device: self._stream(device, kind.tracks_wrists) for device in kind.devices}
+        optional = [device for device in kind.optional if device in recording.tracked]
+        self.streams = {device: self._stream(device, kind.tracks_wrists) for device in (*kind.devices, *optional)}
 
     @property
     def name(self) -> str:
