@@ -9,6 +9,7 @@ import torch
 
 from drawn_windows import numbers
 from wearcap.boundary.tensors import read_tensors, write_tensors
+from wearcap.data import windows as windows_module
 from wearcap.data.bodies import OtherBodies
 from wearcap.data.packing import KEPT, Packed, Track, joined, kept, kept_track, quantized, require_rows
 from wearcap.data.transforms import Shift
@@ -208,6 +209,21 @@ def test_a_second_training_reads_files_and_makes_damaged_ones_anew(tmp_path, mon
     store.add(replace(store.load("r1"), name="r0"), split="train", config_hash="test")
     windows(tmp_path)
     assert len(makes) == 2 + len(files)
+
+
+def test_many_recordings_are_packed_by_all_cores_into_the_same_files(tmp_path, monkeypatch):
+    for name in ("one", "all"):
+        small_dataset(tmp_path / name)
+    first = windows(tmp_path / "one")
+    monkeypatch.setattr(windows_module, "SPREAD", 2)
+    monkeypatch.setattr(windows_module, "cpu_count", lambda: 2)
+    with monkeypatch.context() as patched:
+        patched.setattr(WatchContent, "track", lambda *args: pytest.fail("made in this process"))
+        assert alike(windows(tmp_path / "all"), first)
+    files = [sorted((tmp_path / name).rglob("windows-*/*.safetensors")) for name in ("one", "all")]
+    for one, other in zip(*files, strict=True):
+        assert one.name == other.name
+        assert one.read_bytes() == other.read_bytes()
 
 
 def test_a_data_set_that_is_only_read_still_trains(tmp_path):

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int64
+from joblib import cpu_count
 from rich.progress import track as progress
 from torch import Tensor
 
@@ -28,6 +29,7 @@ from wearcap.data.transforms import Cutting, TimeStretch
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.models.layers import Normalizer
+from wearcap.parallel import Parallel, divided
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.runtime.stages import code_digest, digest
@@ -36,6 +38,8 @@ MIN_SCALE = 0.05
 """Smallest standard deviation that features are divided by: rotations that hardly vary would become mostly noise."""
 ARM_VERSIONS = 3
 """Number of tracks of a recording with the arms of others (`OtherBodies.arms`)."""
+SPREAD, CHUNKS = 200, 8
+"""Fewest recordings without a file that all cores pack, whose processes take seconds to start, and parts of them for each core."""
 ARM_FRAMES = 240_000
 """About the most frames of a data set that arms are taken from; of larger ones, recordings evenly chosen."""
 
@@ -255,9 +259,11 @@ class _Cached:
         group = cache(lambda root: digest([each.sha256 for each in self.donors if each.store.root == root])[:16])
         names = [f"{each.sha256[:32]}-{each.rate}" + f"-{k}-{group(each.store.root)}" * (k > 0) for each, k in made]
 
+        paths = [self.folders[each.store.root] / f"{name}.safetensors" for (each, _), name in zip(made, names)]
+
         def tracks() -> Iterator[Track]:
-            for each, name in zip(progress(made, "packing recordings", transient=True, disable=len(made) < 8), names):
-                path = self.folders[each[0].store.root] / f"{name}.safetensors"
+            self._spread([(each, path) for (each, version), path in zip(made, paths) if not version])
+            for each, path in zip(progress(made, "packing recordings", transient=True, disable=len(made) < 8), paths):
                 track = kept_track(path, partial(self._made, *each))
                 yield _of_wearer(track, self.content.parts) if summed else track
 
@@ -267,19 +273,39 @@ class _Cached:
             forget_old(used)
         return packed
 
+    def _spread(self, made: Sequence[tuple[_Chosen, Path]]) -> None:
+        """Make the missing files of many recordings on all cores."""
+        missing = [(each, path) for each, path in made if not path.is_file()]
+        if len(missing) < SPREAD or cpu_count() < 2:
+            return
+        chunks = divided(missing, -(-len(missing) // (CHUNKS * cpu_count())))
+        done = Parallel().run(partial(_keep, self.content), chunks, missing[0][1].parent)
+        for _ in progress(done, "packing recordings", len(chunks), transient=True):
+            pass
+
     def _made(self, each: _Chosen, version: int) -> Track:
-        recording = (file := each.file).load()
+        recording = each.file.load()
         if version and recording.motion is not None:
             seed = int(each.sha256[:8], 16) + version
-            mixed = self._arms(each.store.root).mixed(recording.motion, file, seed)
+            mixed = self._arms(each.store.root).mixed(recording.motion, each.file, seed)
             recording = replace(recording, motion=mixed)
-        twins = {name: torch.tensor(order) for name, order in self.content.twins(file).items()}
-        return replace(self.content.track(each.store, each.name, recording, each.rate), twins=twins)
+        return _track(self.content, each, recording)
 
     def _arms_in(self, root: Path) -> ArmDonors:
         donors = [each for each in self.donors if each.store.root == root]
         frames = sum(each.store.entries[each.name].frames for each in donors)
         return ArmDonors([each.file for each in donors[:: 1 + frames // ARM_FRAMES]])
+
+
+def _track(content: Content, each: _Chosen, recording: Recording) -> Track:
+    twins = {name: torch.tensor(order) for name, order in content.twins(each.file).items()}
+    return replace(content.track(each.store, each.name, recording, each.rate), twins=twins)
+
+
+def _keep(content: Content, made: Sequence[tuple[_Chosen, Path]]) -> None:
+    """Write the files of some recordings, in a process of its own."""
+    for each, path in made:
+        kept_track(path, lambda each=each: _track(content, each, each.file.load()))
 
 
 def _of_wearer(track: Track, parts: frozenset[str]) -> Track:
