@@ -149,7 +149,7 @@ def _check_axes(check: Check, motion: Motion, parts: Landmarks) -> list[Finding]
     ahead = torch.linalg.cross(across[0], upward[0])
     walks = stands & (linear_velocity(root).norm(dim=-1) > 0.5) & ((ahead * way).sum(-1) > 0.9)
     evidence, severity = [], 0
-    limits = (("pelvis", parts.root, 0.8, 0.5), ("trunk", parts.spine[-1], 0.8, 0.5), ("head", parts.head, 0.3, 0.3))
+    limits = (("pelvis", parts.root, 0.8, 0.5), ("trunk", parts.spine[-1], 0.75, 0.5), ("head", parts.head, 0.3, 0.3))
     for name, joint, least_up, least_ahead in limits:
         R = T.R[:, joint].double()
         up, aside = R[stands, 2, 2].mean().item(), R[stands, 2, 1].mean().abs().item()
