@@ -6,13 +6,13 @@ import pytest
 import torch
 from scipy.stats import norm, t
 
-from tests.wearcap_testing import recording_of, swaying_motion
 from wearcap.errors import WearcapError
 from wearcap.evaluation.certainty import refitted
 from wearcap.metrics.certainty import certainty_scores
 from wearcap.models.checkpoint import load_trained, read_checkpoint, share_checkpoint
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import Captured, CaptureInput, System
+from wearcap_testing import recording_of, swaying_motion
 
 DOF, WIDER = 3.0, 1.7
 

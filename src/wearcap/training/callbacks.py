@@ -229,5 +229,5 @@ class FitSpread(Callback):
             away = torch.cat(found, 1)
             factor = away.quantile(0.6827, dim=1).clamp_min(LEAST_FACTOR)
             module.net.motion_normalizer.mean[-len(factor) :] = factor.log()
-            told = factor > LEAST_FACTOR  # not the head, which is measured
-            module.joint_dof.fill_(tails(away[told] / factor[told, None])[1] or 0.0)
+            predicted = factor > LEAST_FACTOR  # not the head, which is measured
+            module.joint_dof.fill_(tails(away[predicted] / factor[predicted, None])[1] or 0.0)
