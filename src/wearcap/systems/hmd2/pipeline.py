@@ -79,6 +79,7 @@ class HMD2(LearnedSystem):
 
     name = "hmd2"
     pipeline = "hmd2"
+    sampled = "ablation/hmd2_sampled"
     experiment = "experiment=hmd2"
     shared = ("hmd2",)
     required = (HEAD, POINTS, HEIGHT)
