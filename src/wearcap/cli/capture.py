@@ -104,8 +104,7 @@ def captured(config: Any, system: System) -> Motion | None:
             for number, seed in enumerate(track(seeds, description="samples")):
                 draws[f"sample {number}"] = draw = drawing(source, seed)
                 write_motion(draw, folder / f"sample-{number}.npz")
-            rows = shown | {"mean": motion} | draws
-            body = anny_body(motion.skeleton, recording.shape or None)
+            body, rows = anny_body(motion.skeleton, recording.shape or None), shown | {"mean": motion} | draws
             save_png(folder / "samples.png", contact_sheet(rows, body=body, environment=environment))
         if filmed_s:
             body = anny_body(motion.skeleton, recording.shape or None) if config.body else None

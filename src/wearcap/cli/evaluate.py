@@ -92,7 +92,7 @@ def run(config: DictConfig) -> Scores:
     of_method = {name: rows}
     if config.samples > 1:
         best = f"best of {config.samples} samples"
-        drawn = scoring.samples(systems[0], together[0], best)
+        drawn = scoring.of(sampling(systems[0]), together[0], range(config.samples), best, best, sampled=True)
         require_all(drawn, store.root)
         of_method[best] = best_samples(rows_of(drawn))
     if config.baselines and systems[0].baselines:
@@ -184,24 +184,15 @@ class _Scoring:
         self.activity_of = {name: store.entries[name].context.activity for name in names}
 
     def of(
-        self, system: System, checkpoints: Sequence[str], seeds: Sequence[int], title: str, method: str
+        self,
+        system: System,
+        checkpoints: Sequence[str],
+        seeds: Sequence[int],
+        title: str,
+        method: str,
+        sampled: bool = False,
     ) -> list[Outcome]:
-        """Outcomes of a configured system, whose workers load it by themselves."""
-        key, make = self._loading(system, checkpoints, seeds)
-        return self.outcomes(self.names, system, make, key, seeds, title, method, parallel_of(self.config))
-
-    def samples(self, system: System, checkpoints: Sequence[str], label: str) -> list[Outcome]:
-        """Outcomes of the samples of a configured system, `config.samples` of each recording. Raises WearcapError for one that
-        draws none."""
-        seeds = list(range(self.config.samples))
-        key, make = self._loading(sampling(system), checkpoints, seeds, sampled=True)
-        how = parallel_of(self.config)
-        return self.outcomes(self.names, system, make, key, seeds, label, label, how, samples=True)
-
-    def _loading(
-        self, system: System, checkpoints: Sequence[str], seeds: Sequence[int], sampled: bool = False
-    ) -> tuple[str, Callable[[], System]]:
-        """The key of a configured system, which this process has, and what makes it in others."""
+        """Outcomes of a configured system, or of one that `sampling` made of it, whose workers load it by themselves."""
         values = {name: self.config[name] for name in CAPTURING}
         plain: dict[str, Any] = {
             name: OmegaConf.to_container(value, resolve=True) if isinstance(value, DictConfig) else value
@@ -209,7 +200,8 @@ class _Scoring:
         }
         key = settings_key(plain | {"seeds": list(seeds), "sampled": sampled}, checkpoints)
         loaded(key, lambda: system)
-        return key, partial(_load, list(checkpoints), plain["pipeline"], self.config.device, sampled)
+        make = partial(_load, list(checkpoints), plain["pipeline"], self.config.device, sampled)
+        return self.outcomes(self.names, system, make, key, seeds, title, method, parallel_of(self.config), sampled)
 
     def outcomes(
         self,

@@ -26,9 +26,7 @@ def run(config: DictConfig) -> dict[str, ExportReport]:
         show(f"checkpoint: {config.output}")
         return {}
     if config.fit is not None:
-        raise WearcapError(
-            f"fit={config.fit} format={config.format}", expected="format=safetensors, which is then exported"
-        )
+        raise WearcapError(f"fit=… format={config.format}", expected="format=safetensors, which is then exported")
     exports = load_pipeline(config.checkpoint, config.pipeline, "cpu").exports()
     reports = write_exports(exports, config.output, config.format)
     for name, report in reports.items():

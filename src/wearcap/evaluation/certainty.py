@@ -31,12 +31,10 @@ def refitted(system: System, checkpoint: str | Path, store: RecordingStore, name
         motion, truth, _ = comparable(system(source), source.recording, name)
         found, joints = deviations(motion, truth), len(motion.skeleton)
         if found is None or mean is None:
-            expected = "one with features.spread=true, such as hmd2 or mocap_every"
-            raise WearcapError("a network that does not say how sure it is of joints", checkpoint, expected)
+            raise WearcapError("a network that does not say how sure it is", checkpoint, "features.spread=true")
         away.append(found[~found.isnan()])
-    if not away:
+    if not away or mean is None:
         raise WearcapError("no recordings to fit to", store.root, fix="Choose a data set with a validation split.")
-    assert mean is not None
     factor, dof = tails(torch.cat(away))
     mean[-joints:] += torch.tensor(factor).log()
     return {_MEAN: mean, "joint_dof": torch.tensor(dof or 0.0)}

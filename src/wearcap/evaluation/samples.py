@@ -27,8 +27,7 @@ class Spread:
     def __call__(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
         row, joints = self._measure(motion, source, seed), motion.T_world_joint.t
         before = self._before[1] if self._before[0] == row.recording else []
-        apart = [mpjpe_cm(joints, other).item() for other in before]
-        self._before = row.recording, [*before, joints]
+        self._before, apart = (row.recording, [*before, joints]), [mpjpe_cm(joints, other).item() for other in before]
         return replace(row, scores=row.scores | {DIVERSITY: sum(apart) / len(apart) if apart else math.nan})
 
 

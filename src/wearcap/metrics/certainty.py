@@ -49,6 +49,5 @@ def tails(away: Float[Tensor, "*error"]) -> tuple[float, float | None]:
     heaviest, normal = (reach(SHARES["within_95"], dof) for dof in DOF)
     if far <= normal * near:
         return near, None
-    if far >= heaviest * near:
-        return near, DOF[0]
-    return near, root_scalar(lambda dof: reach(SHARES["within_95"], dof) - far / near, bracket=DOF).root
+    ratio = min(far / near, heaviest)
+    return near, root_scalar(lambda dof: reach(SHARES["within_95"], dof) - ratio, bracket=DOF).root

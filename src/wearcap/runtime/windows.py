@@ -103,15 +103,12 @@ class FinalPoses(NamedTuple):
         """What refinement knows of these frames."""
         return Measured.of(self.T_world_head, self.floor_height)
 
-    def motion(
-        self, skeleton: Skeleton, provenance: dict[str, str], contacts: bool = True, joint_dof: float | None = None
-    ) -> Motion:
-        """The poses as a motion; `contacts`: whether contacts were predicted, of both patches of a foot alike; `joint_dof`: as
-        of a `Motion`."""
+    def motion(self, skeleton: Skeleton, provenance: dict[str, str], contacts: bool = True) -> Motion:
+        """The poses as a motion; `contacts`: whether contacts were predicted, of both patches of a foot alike."""
         contact_prob = self.contact_prob.repeat_interleave(2, -1) if contacts else None
         poses, joint_std = (self.R_parent_joint, self.t_world_root, contact_prob), self.joint_std
-        known = {"joint_std": joint_std, "joint_dof": joint_dof} if joint_std.shape[1] else {}
-        return Motion(self.timestamps, skeleton, *poses, **known, provenance=provenance)
+        known = joint_std if joint_std.shape[1] else None
+        return Motion(self.timestamps, skeleton, *poses, joint_std=known, provenance=provenance)
 
 
 class StretchWindows(Window[Frames], ABC):

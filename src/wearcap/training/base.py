@@ -69,9 +69,7 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
     joint_dof: Tensor | None
     """Degrees of freedom of the joints' errors in the network's own deviations, fitted with these; 0: none was fitted."""
 
-    def __init__(
-        self, optimization: Optimization, loss_weights: dict[str, float] | None = None, *, spread: bool = False
-    ):
+    def __init__(self, optimization: Optimization, loss_weights: dict[str, float] | None = None, spread: bool = False):
         """`spread`: whether the network says how sure it is of each joint."""
         super().__init__()
         self.register_buffer("joint_dof", torch.zeros(()) if spread else None)

@@ -275,8 +275,8 @@ class HMD2(LearnedSystem):
             "lookahead": str(self.lookahead_frames),
             "refinement": str(self.refinement),
         }
-        about = settings, self.model.features.contacts, self.model.joint_dof
-        return anchored_to_head(final.motion(skeleton, *about), final.T_world_head)
+        motion = final.motion(skeleton, settings, self.model.features.contacts)
+        return anchored_to_head(replace(motion, joint_dof=self.model.joint_dof), final.T_world_head)
 
 
 def _bridged(motion: Motion, stretches: tuple[tuple[int, int], ...]) -> Motion:

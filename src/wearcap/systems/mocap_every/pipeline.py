@@ -213,7 +213,7 @@ class MocapEvery(LearnedSystem):
         """Step 4: estimated poses as a motion, anchored to the measured head."""
         about = self.settings() | {"refinement": self.refinement}
         settings = {"pipeline": "mocap_every"} | {name: str(about[name]) for name in about}
-        motion = final.motion(skeleton, settings, joint_dof=self.model.joint_dof)
+        motion = replace(final.motion(skeleton, settings), joint_dof=self.model.joint_dof)
         return anchored_to_head(motion, final.T_world_head) if self.anchor else motion
 
     def _follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:
