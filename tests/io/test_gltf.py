@@ -205,6 +205,18 @@ def test_sticks_reach_from_joint_to_joint(tmp_path):
         assert np.linalg.norm(vertices - joint, axis=-1).min() < 0.03  # a stick is 2.2 cm thick
 
 
+def test_deviations_lie_in_the_animations_extras(tmp_path):
+    motion = sample()
+    write_glb(motion, tmp_path / "m.glb")
+    assert "extras" not in Glb((tmp_path / "m.glb").read_bytes()).json["animations"][0]
+    std = torch.rand(len(motion), len(motion.skeleton), generator=torch.Generator().manual_seed(2))
+    write_glb(dataclasses.replace(motion, joint_std=std, joint_dof=2.5), tmp_path / "m.glb")
+    found = Glb((tmp_path / "m.glb").read_bytes()).json["animations"][0]["extras"]
+    assert found["joint_dof"] == 2.5
+    rows = torch.tensor([found["joint_std_mm"][name] for name in motion.skeleton.joint_names]).T / 1000
+    torch.testing.assert_close(rows, std, atol=5.1e-4, rtol=0)
+
+
 def test_trimesh_opens_it(tmp_path):
     motion = sample()
     write_glb(motion, tmp_path / "m.glb", blob(motion.skeleton))

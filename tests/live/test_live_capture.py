@@ -418,7 +418,8 @@ def test_a_recording_of_many_sections_is_one_motion(tmp_path: Path):
 def test_clients_of_the_websocket_get_skeleton_and_frames():
     port = free_port()
     sink = WebSocketSink(Address("ws", "127.0.0.1", port), pace=False)
-    thread, motion = SinkThread(sink), swaying_motion(5, 0)
+    std = torch.rand(5, 23, generator=torch.Generator().manual_seed(0))
+    thread, motion = SinkThread(sink), replace(swaying_motion(5, 0), joint_std=std)
     thread.start()
     with connect(sink.url) as client:
         thread.begin("anna", motion.skeleton, 60.0)
@@ -428,6 +429,7 @@ def test_clients_of_the_websocket_get_skeleton_and_frames():
         frames = [json.loads(client.recv(5.0)) for _ in range(5)]
     R = matrix_from_quat_wxyz(torch.tensor([frame["rotations_wxyz"] for frame in frames], dtype=torch.float64))
     torch.testing.assert_close(R.float(), motion.R_parent_joint, atol=1e-4, rtol=0)
+    torch.testing.assert_close(torch.tensor([frame["joint_std"] for frame in frames]), std, atol=6e-5, rtol=0)
     with pytest.raises(InvalidStatus):
         connect(sink.url, origin="http://elsewhere.example")  # type: ignore[arg-type]
     thread.close()

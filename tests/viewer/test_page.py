@@ -97,6 +97,21 @@ def test_feet_are_coloured_by_contact(page):
     assert tuple(feet.balls[0].color) == AIR_COLOR
 
 
+def test_balls_are_as_large_as_deviations_and_none_are_where_nothing_is_said(page):
+    walk = a_walk(sideways=0.3)
+    std = 0.01 + 0.001 * torch.arange(len(walk))[:, None] + 0.002 * torch.arange(len(walk.skeleton))
+    sure = Page(a_recording(), {"capture": replace(walk, joint_std=std)}, port=18085)
+    sure.timeline.seek(1.0)
+    sure.show()
+    balls = sure.bodies["capture"].certainty
+    np.testing.assert_allclose(balls.handle.batched_scales, std[30].numpy(), rtol=1e-6)
+    placed = balls.handle.batched_positions + balls.handle.position
+    np.testing.assert_allclose(placed, walk.T_world_joint.t[30].numpy(), atol=1e-5)
+    assert sure.bodies["truth"].certainty is None
+    assert page.bodies["capture"].certainty is None
+    sure.stop()
+
+
 def test_layouts_and_keys(page):
     page.arrange("beside")
     truth, capture = (page.bodies[name].body.handle for name in ("truth", "capture"))

@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from wearcap.apps.viewer.page_layers import GUESSED_COLOR, GUESSED_M, stick_body, vertex_colors
 from wearcap.apps.viewer.picture import SKY, contact_sheet, draw_head_path, save_png, shared_frames, write_video
 from wearcap.cli import render as render_verb
 from wearcap.errors import WearcapError
@@ -69,6 +70,23 @@ def test_contacts_colour_the_feet():
     red = (marked[..., 0] - marked[..., 2] > 70) & (np.abs(marked - plain).sum(-1) > 60)
     assert red.sum() > 10
     assert np.nonzero(red)[0].mean() > 110
+
+
+def test_what_is_known_roughly_is_of_another_colour():
+    motion, color = swaying_motion(3), np.array([0.4, 0.5, 0.6])
+    body, left = stick_body(motion.skeleton), motion.skeleton.index("left_elbow")
+    assert vertex_colors(body, motion, 0, color) is color
+    std = torch.full((3, 23), GUESSED_M[0])
+    std[1, [left, motion.skeleton.index("left_wrist")]] = GUESSED_M[1]
+    sure = replace(motion, joint_std=std)
+    np.testing.assert_allclose(vertex_colors(body, sure, 0, color), np.tile(color, (len(body.rest_vertices), 1)))
+    found, bone = vertex_colors(body, sure, 1, color), body.skin_joints[:, 0].numpy()
+    np.testing.assert_allclose(found[bone == left], np.tile(GUESSED_COLOR, ((bone == left).sum(), 1)))
+    shoulder = found[bone == motion.skeleton.index("left_shoulder")]  # one of its ends is known
+    np.testing.assert_allclose(shoulder, np.tile((color + GUESSED_COLOR) / 2, (len(shoulder), 1)))
+    np.testing.assert_allclose(found[bone == 0], np.tile(color, ((bone == 0).sum(), 1)))
+    sheets = [contact_sheet({"a": each}, [1], size=(80, 100)).astype(int) for each in (motion, sure)]
+    assert np.abs(sheets[1] - sheets[0]).max() > 40
 
 
 def test_video_has_the_frames_and_both_panels(tmp_path):

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from rich import print as show
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import track
 from torch import Tensor
 
 from wearcap.apps.live.capture import LiveCapture
@@ -26,7 +27,14 @@ from wearcap.body.smpl_body import betas_of, smpl_body, template_pelvis
 from wearcap.checks import require_sound
 from wearcap.checks.consistency import SCAN_FILE
 from wearcap.cli.capture_all import capture_all, is_dataset
-from wearcap.cli.conf import hydra_application, load_pipeline, run_application, with_pipeline, with_pipeline_of_content
+from wearcap.cli.conf import (
+    hydra_application,
+    load_pipeline,
+    run_application,
+    sampling,
+    with_pipeline,
+    with_pipeline_of_content,
+)
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -69,11 +77,12 @@ def captured(config: Any, system: System) -> Motion | None:
     filmed_s = _filmed_s(config.video)
     source = _input(config, system)
     recording = source.recording
-    seeds = range(config.seed, config.seed + (config.samples if system.draws else 1))
+    seeds = range(config.seed, config.seed + config.samples)
+    drawing = sampling(system) if len(seeds) > 1 else None
     cache = None if config.cache is None else Path(config.cache)
     options = StageOptions(cache, config.until, Console(stderr=True))
-    captures = system.capture([source] * len(seeds), seeds, options)
-    motion, report = captures[0].motion, captures[0].report
+    (capture,) = system.capture([source], [config.seed], options)
+    motion, report = capture.motion, capture.report
     if report is not None:
         write_text(folder / "report.json", json.dumps(report, indent=1) + "\n")
     if motion is not None:
@@ -90,13 +99,13 @@ def captured(config: Any, system: System) -> Motion | None:
         environment = None if motion.object_motion is None else system.objects(source)
         truth = with_objects(recording, environment)
         shown = {} if truth is None else {"truth": truth}
-        if len(captures) > 1:  # sample-0.npz, …, and samples.png: the variety from one input (thesis Fig. 6.6)
-            motions = [each.motion for each in captures if each.motion is not None]
-            draws = {f"sample {number}": draw for number, draw in enumerate(motions)}
-            for label, draw in draws.items():
-                write_motion(draw, folder / f"{label.replace(' ', '-')}.npz")
-            body = anny_body(motion.skeleton, recording.shape or None)
-            save_png(folder / "samples.png", contact_sheet(shown | draws, body=body, environment=environment))
+        if drawing is not None:  # sample-0.npz, …, and samples.png: the variety from one input (thesis Fig. 6.6)
+            draws = {}
+            for number, seed in enumerate(track(seeds, description="samples")):
+                draws[f"sample {number}"] = draw = drawing(source, seed)
+                write_motion(draw, folder / f"sample-{number}.npz")
+            body, rows = anny_body(motion.skeleton, recording.shape or None), shown | {"mean": motion} | draws
+            save_png(folder / "samples.png", contact_sheet(rows, body=body, environment=environment))
         if filmed_s:
             body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
             shown |= {"capture": motion}

@@ -7,8 +7,9 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import torch
@@ -342,6 +343,17 @@ def load_systems(given: Sequence[str | Path], pipeline: Any, device: str, shared
         raise WearcapError(f"no checkpoint, but {kind.__name__} needs a trained network", fix=fix)
     together = [given] if kind.joins_checkpoints else [[checkpoint] for checkpoint in given]
     return [kind.trained(made, checkpoints, device) for checkpoints in together]
+
+
+def sampling(system: System) -> System:
+    """The system, with its network, that draws one of the plausible motions for each seed. Raises WearcapError where it has no
+    such configuration."""
+    if system.sampled is None:
+        raise WearcapError(
+            f"samples of {system.name}, which draws none", expected="hmd2 or echo", fix="Give samples=1."
+        )
+    pipeline = compose("capture", ["recording=none", f"pipeline={system.sampled}"]).pipeline
+    return replace(cast(Any, system), sampling=instantiate(pipeline.sampling, _convert_="all"))
 
 
 def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:

@@ -12,7 +12,15 @@ from rich import print as show
 
 from wearcap.apps.viewer.page_layers import with_objects
 from wearcap.apps.viewer.picture import contact_sheet, save_png
-from wearcap.cli.conf import hydra_application, load_systems, parallel_of, run_application, trained_on, with_pipeline
+from wearcap.cli.conf import (
+    hydra_application,
+    load_systems,
+    parallel_of,
+    run_application,
+    sampling,
+    trained_on,
+    with_pipeline,
+)
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
@@ -39,6 +47,7 @@ from wearcap.evaluation.datasets import (
     write_outcomes,
 )
 from wearcap.evaluation.evaluate import Realism
+from wearcap.evaluation.samples import best_samples
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
 from wearcap.parallel import Parallel
 from wearcap.prepare.files import with_own_files
@@ -81,6 +90,11 @@ def run(config: DictConfig) -> Scores:
         require_all(outcomes, store.root)
         raise WearcapError(f"no recordings of split {config.split}", store.root, fix="Choose another split.")
     of_method = {name: rows}
+    if config.samples > 1:
+        best = f"best of {config.samples} samples"
+        drawn = scoring.of(sampling(systems[0]), together[0], range(config.samples), best, best, sampled=True)
+        require_all(drawn, store.root)
+        of_method[best] = best_samples(rows_of(drawn))
     if config.baselines and systems[0].baselines:
         of_method |= _baselines(scoring, systems[0].baselines, checkpoints[0], {row.recording for row in rows})
     scores = {method: _summaries(found, realism, method) for method, found in of_method.items()}
@@ -170,18 +184,24 @@ class _Scoring:
         self.activity_of = {name: store.entries[name].context.activity for name in names}
 
     def of(
-        self, system: System, checkpoints: Sequence[str], seeds: Sequence[int], title: str, method: str
+        self,
+        system: System,
+        checkpoints: Sequence[str],
+        seeds: Sequence[int],
+        title: str,
+        method: str,
+        sampled: bool = False,
     ) -> list[Outcome]:
-        """Outcomes of a configured system, whose workers load it by themselves."""
+        """Outcomes of a configured system, or of one that `sampling` made of it, whose workers load it by themselves."""
         values = {name: self.config[name] for name in CAPTURING}
         plain: dict[str, Any] = {
             name: OmegaConf.to_container(value, resolve=True) if isinstance(value, DictConfig) else value
             for name, value in values.items()
         }
-        key = settings_key(plain | {"seeds": list(seeds)}, checkpoints)
+        key = settings_key(plain | {"seeds": list(seeds), "sampled": sampled}, checkpoints)
         loaded(key, lambda: system)
-        make = partial(_load, list(checkpoints), plain["pipeline"], self.config.device)
-        return self.outcomes(self.names, system, make, key, seeds, title, method, parallel_of(self.config))
+        make = partial(_load, list(checkpoints), plain["pipeline"], self.config.device, sampled)
+        return self.outcomes(self.names, system, make, key, seeds, title, method, parallel_of(self.config), sampled)
 
     def outcomes(
         self,
@@ -193,8 +213,10 @@ class _Scoring:
         title: str,
         method: str,
         how: Parallel,
+        samples: bool = False,
     ) -> list[Outcome]:
-        """Outcomes of a system that `make` makes; with `realism`, whose latents are kept here, in this process."""
+        """Outcomes of a system that `make` makes; with `realism`, whose latents are kept here, in this process. `samples`: as of
+        `scored`."""
         config, realism = self.config, self.realism
         chunk = max(1, config.batch_size // len(seeds)) if system.draws else 1
         measure = None if realism is None else realism.beside(system.score, method)
@@ -210,6 +232,7 @@ class _Scoring:
             cache=None if config.cache is None else Path(config.cache),
             check=config.check,
             measure=measure,
+            samples=samples,
         )
         notes = Path(config.output).with_suffix(".finished") / title.replace(" ", "_")
         found = over_recordings(
@@ -226,8 +249,9 @@ class _Scoring:
         return list(found)
 
 
-def _load(checkpoints: list[str], pipeline: dict[str, Any], device: str) -> System:
-    return load_systems(checkpoints, pipeline, device)[0]
+def _load(checkpoints: list[str], pipeline: dict[str, Any], device: str, sampled: bool) -> System:
+    system = load_systems(checkpoints, pipeline, device)[0]
+    return sampling(system) if sampled else system
 
 
 def _baselines(scoring: _Scoring, labels: Sequence[str], checkpoint: str, names: set[str]) -> dict[str, list[Row]]:

@@ -25,6 +25,7 @@ from wearcap.boundary.texts import read_json
 from wearcap.checks import require_sound
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import Measure, evaluate
+from wearcap.evaluation.samples import Spread
 from wearcap.files import remembered_sha256, write_text
 from wearcap.io.formats.scene_folder import cloud_file, used_files
 from wearcap.locks import folder_lock
@@ -209,8 +210,10 @@ def scored(
     cache: Path | None = None,
     check: bool = False,
     measure: Measure | None = None,
+    samples: bool = False,
 ) -> list[Outcome]:
-    """Outcomes of some recordings that are captured with every seed and scored; seconds are shared out by frames.
+    """Outcomes of some recordings that are captured with every seed and scored; seconds are shared out by frames. `samples`: the
+    seeds' motions are scored by how far they are apart, too.
 
     Raises WearcapError as `evaluate` does, and with `check` for a recording in which the doctor finds an error.
     """
@@ -218,6 +221,7 @@ def scored(
     for name in names if check else ():
         require_sound(store.load(name))
     made = loaded(key, system)
+    measure = Spread(measure or made.score) if samples else measure
     begin = time.perf_counter()
     found = evaluate(made, store, names, seeds, batch_size, measure, scene, metres_per_unit, StageOptions(cache))
     rows: dict[str, list[Row]] = {name: [] for name in names}

@@ -19,7 +19,7 @@ from wearcap.recording.motion import Motion
 def on_skeleton(motion: Motion, skeleton: Skeleton) -> Motion:
     """The motion retargeted to another skeleton, without the deviations of joints that it does not have. Raises WearcapError where limbs are not recognised."""
     R, root = retarget(motion.skeleton, skeleton, motion.R_parent_joint, motion.t_world_root)
-    return replace(motion, skeleton=skeleton, R_parent_joint=R, t_world_root=root, joint_std=None)
+    return replace(motion, skeleton=skeleton, R_parent_joint=R, t_world_root=root, joint_std=None, joint_dof=None)
 
 
 def write_smplh(motion: Motion, path: Path) -> None:

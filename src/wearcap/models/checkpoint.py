@@ -104,6 +104,9 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
         raise WearcapError("its checksum differs from its content", where=path, fix="Fetch the file again.")
     brought_up_to_date(config["model"])
     check_config(config["model"], path)
+    features = config["model"].get("features")
+    if isinstance(features, dict) and features.get("spread") is True:
+        state.setdefault("joint_dof", torch.zeros(()))  # files of before were fitted without tails
     halves = (torch.float16, torch.bfloat16)
     return config, {name: v.float() if v.dtype in halves else v for name, v in state.items()}
 
@@ -150,12 +153,14 @@ def load_network(path: str | Path, kind: type[Network], experiment: str, *, part
     return network
 
 
-def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float32") -> None:
+def share_checkpoint(
+    source: str | Path, target: str | Path, dtype: str = "float32", changed: Mapping[str, Tensor] | None = None
+) -> None:
     """Write a shareable file of a checkpoint: averaged weights, statistics, the model's config, names of the data, and
     what the training took.
 
     Weights of two or more axes are stored as `dtype` (of `DTYPES`); biases, norms and statistics stay as they are.
-    Folders of this machine are left out. Raises WearcapError for a source that `read_checkpoint` refuses, a target
+    Folders of this machine are left out; `changed` tensors replace the checkpoint's by their names. Raises WearcapError for a source that `read_checkpoint` refuses, a target
     that is no `.safetensors` file, and weights that are not finite in that type.
     """
     if Path(target).suffix != _SUFFIX:
@@ -165,7 +170,7 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
     config, state = read_checkpoint(source)
     narrow = {
         name: value.to(DTYPES[dtype]) if value.dtype == torch.float32 and value.ndim > 1 else value
-        for name, value in state.items()
+        for name, value in (state | dict(changed or {})).items()
     }
     for name, value in narrow.items():
         if value.is_floating_point() and not value.isfinite().all():

@@ -1,5 +1,6 @@
 """The Motion (output of a pipeline, or ground truth), and interactions: which hands hold which object at which time."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -7,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
+from scipy import special
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
@@ -57,6 +59,13 @@ class Interactions:
         return (within[..., None] & self.hands).any(1)
 
 
+def reach(share: float, dof: float | None) -> float:
+    """Distance within which a share (0…1) of errors is, divided by that of 68.3 %, under Student's t distribution of `dof`
+    degrees of freedom; None: under the normal distribution."""
+    dof = math.inf if dof is None else dof
+    return float(special.stdtrit(dof, (1 + share) / 2) / special.stdtrit(dof, special.ndtr(1.0)))
+
+
 ESTIMATES = ("contact_prob", "hand_contact_prob", "body_contact_prob", "joint_std")
 """Optional fields of a Motion with a row per frame."""
 PER_FRAME = ("timestamps", "R_parent_joint", "t_world_root", *ESTIMATES)
@@ -83,7 +92,10 @@ class Motion:
     provenance: dict[str, str] = field(default_factory=dict)
     """Pipeline, checkpoint and config hash, or the source of a ground truth."""
     joint_std: Float[Tensor, "time joint"] | None = None
-    """Standard deviation (m) along each axis of every joint's position, as the system expects it."""
+    """Distance (m) along each axis within which the system expects 68.3 % of the errors of every joint's position: of normal
+    errors the standard deviation."""
+    joint_dof: float | None = None
+    """Degrees of freedom of Student's t distribution that these errors follow; None: they are normal."""
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -99,6 +111,11 @@ class Motion:
     def T_world_joint(self) -> Rigid:
         """Poses of all joints: R "time joint 3 3", t "time joint 3"."""
         return forward_kinematics(self.skeleton, self.R_parent_joint, self.t_world_root)
+
+    def joint_within(self, share: float) -> Float[Tensor, "time joint"] | None:
+        """Distance (m) along each axis within which this share (0…1) of every joint's errors is expected; None of a motion
+        that does not say how sure it is."""
+        return None if self.joint_std is None else reach(share, self.joint_dof) * self.joint_std
 
     def joint(self, name: str) -> Rigid:
         """Pose of one joint over time."""

@@ -119,6 +119,9 @@ class System(ABC):
     """Shared checkpoints of the networks, which `wearcap.load` takes unless others are given."""
     joins_checkpoints: ClassVar[bool] = False
     """Whether several checkpoints make one system; otherwise each of them makes its own."""
+    sampled: ClassVar[str | None] = None
+    """Config (pipeline=…) whose `sampling` draws one of the plausible motions for each seed, in place of their mean; None:
+    there is none."""
     draws: ClassVar[bool] = True
     """Whether captures depend on the seed."""
     required: ClassVar[tuple[Any, ...]] = ()

@@ -66,9 +66,19 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
     parts: ClassVar[tuple[str, ...]] = ()
     """Attributes that are constructor arguments of the system's pipeline."""
 
-    def __init__(self, optimization: Optimization, loss_weights: dict[str, float] | None = None):
+    joint_dof: Tensor | None
+    """Degrees of freedom of the joints' errors in the network's own deviations, fitted with these; 0: none was fitted."""
+
+    def __init__(self, optimization: Optimization, loss_weights: dict[str, float] | None = None, spread: bool = False):
+        """`spread`: whether the network says how sure it is of each joint."""
         super().__init__()
+        self.register_buffer("joint_dof", torch.zeros(()) if spread else None)
         self.optimization, self.loss_weights = optimization, dict(loss_weights or {})
+
+    @property
+    def fitted_dof(self) -> float | None:
+        """As of a `Motion`."""
+        return None if self.joint_dof is None else self.joint_dof.item() or None
 
     def set_statistics(self, dataset: Any) -> None:
         """Compute normalisation from a training split; a resumed run loads it with the weights."""

@@ -12,6 +12,7 @@ from lightning.pytorch import Callback
 from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
 from rich.progress import TaskID
 
+from wearcap.metrics.certainty import tails
 from wearcap.metrics.table import aggregate
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import first_seconds
@@ -205,9 +206,12 @@ class StepsProgressBar(RichProgressBar):
         return f"epoch {current_epoch}, steps"
 
 
+LEAST_FACTOR = 0.1
+
+
 class FitSpread(Callback):
-    """Scales the joints' deviations after every validation epoch, so that 68 % of the errors are within them; the checkpoint
-    stores the logarithms of the factors as the deviations' mean.
+    """Scales the joints' deviations after every validation epoch, so that 68 % of each joint's errors are within them, and fits
+    the errors' degrees of freedom; the checkpoint stores the logarithms of the factors as the deviations' mean.
 
     It must come before the weight averaging in the list of callbacks: the factors belong to the averaged weights.
     """
@@ -222,5 +226,8 @@ class FitSpread(Callback):
                 return
             found.append(away.movedim(1, 0).flatten(1))
         if found:
-            factor = torch.cat(found, 1).quantile(0.6827, dim=1)
-            module.net.motion_normalizer.mean[-len(factor) :] = factor.clamp_min(0.1).log()
+            away = torch.cat(found, 1)
+            factor = away.quantile(0.6827, dim=1).clamp_min(LEAST_FACTOR)
+            module.net.motion_normalizer.mean[-len(factor) :] = factor.log()
+            predicted = factor > LEAST_FACTOR  # not the head, which is measured
+            module.joint_dof.fill_(tails(away[predicted] / factor[predicted, None])[1] or 0.0)

@@ -18,6 +18,7 @@ from torch import Tensor
 from wearcap.apps.viewer.page_layers import (
     BodyLayer,
     BodyPointsLayer,
+    CertaintyLayer,
     FeetLayer,
     HeadLayer,
     LabelLayer,
@@ -108,7 +109,8 @@ def _layers(
     surface = BodyLayer(server, name, motion, body, color)
     feet = FeetLayer.of(server, f"{name}_feet", motion, recording.contacts if name == TRUTH else None)
     label = LabelLayer(server, name, motion) if several else None
-    return MotionLayers(surface, feet, label, points, objects)
+    sure = None if motion.joint_std is None else CertaintyLayer(server, f"{name}_certainty", motion)
+    return MotionLayers(surface, feet, label, points, objects, sure)
 
 
 class Page(ServedPage):
@@ -188,6 +190,8 @@ class Page(ServedPage):
         self._surroundings.visible = self.layout != BESIDE
         around = gui.add_checkbox("Surroundings", initial_value=self._surroundings.visible)
         around.on_update(lambda _: setattr(self._surroundings, "visible", around.value))
+        if any(placed.certainty for placed in self.bodies.values()):
+            gui.add_html(block("Balls: two in three errors of a joint are no larger, along each axis."))
         self._play.on_click(lambda _: self.toggle())
         self._slider.on_update(self.scrubbed)
         self._speed.on_update(lambda _: setattr(clock, "speed", float(self._speed.value[:-1])))

@@ -36,6 +36,8 @@ from wearcap.scene.objects import Environment, SceneObject
 MAX_POINTS = 200_000
 LABEL_ABOVE_M = 0.3
 """Height (m) of labels above the highest joint."""
+GUESSED_M, GUESSED_COLOR = (0.03, 0.15), np.array([0.93, 0.80, 0.42])
+"""Deviations (m) of a bone of the motion's own colour and of one that is all of the other colour, and that (RGB, 0…1)."""
 CONTACT_COLOR, AIR_COLOR = (230, 60, 40), (190, 190, 190)
 _R_DEVICE_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of a camera (x right, y down, z forward) that looks in the head's direction."""
@@ -123,6 +125,54 @@ class BodyLayer(MotionLayer):
         quaternions = quat_wxyz_from_matrix(pose.R.double()).numpy()
         for bone, wxyz, position in zip(self.handle.bones, quaternions, (pose.t - root).double().numpy()):
             bone.wxyz, bone.position = wxyz, position
+
+
+def vertex_colors(
+    body: BodyModel, motion: Motion, frame: int, color: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "vertex 3"] | Float[np.ndarray, "3"]:
+    """Colours (RGB, 0…1) of a body's vertices: the farther bones are known only roughly (`joint_std`, of both ends), the more
+    of `GUESSED_COLOR`; the one colour of a motion that does not say."""
+    if motion.joint_std is None:
+        return color
+    ends = motion.joint_std[frame].double().numpy()
+    bones = np.stack([ends, ends])  # a joint's bone reaches to its children
+    for joint, parent in enumerate(motion.skeleton.parents):
+        if parent >= 0:
+            bones[1, parent] = max(bones[1, parent], ends[joint])
+    known, guessed = GUESSED_M
+    share = ((bones.mean(0) - known) / (guessed - known)).clip(0.0, 1.0)
+    weights = body.skin_weights.double().numpy()
+    share = (share[body.skin_joints.numpy()] * weights).sum(-1, keepdims=True) / weights.sum(-1, keepdims=True)
+    return color + share * (GUESSED_COLOR - color)
+
+
+class CertaintyLayer(MotionLayer):
+    """A translucent ball around every joint, as large as the distance within which its errors are expected (`joint_std`)."""
+
+    def __init__(self, server: viser.ViserServer, name: str, motion: Motion):
+        self.motion, joints = motion, len(motion.skeleton)
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+        self.handle = server.scene.add_batched_meshes_simple(
+            f"/{name}",
+            np.asarray(ball.vertices),
+            np.asarray(ball.faces),
+            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1)),
+            batched_positions=np.zeros((joints, 3)),
+            batched_scales=np.zeros(joints),
+            batched_colors=tuple(int(255 * part) for part in GUESSED_COLOR),
+            opacity=0.25,
+            cast_shadow=False,
+            lod="off",
+        )
+        super().__init__(self.handle)
+
+    def show(self, time: float) -> None:
+        frame = nearest_frame(self.motion.timestamps, time)
+        assert self.motion.joint_std is not None
+        joints = self.motion.T_world_joint.t[frame].double().numpy()
+        self.handle.position = joints[0] + self.offset
+        self.handle.batched_positions = (joints - joints[0]).astype(np.float32)
+        self.handle.batched_scales = self.motion.joint_std[frame].float().numpy()
 
 
 class FeetLayer(MotionLayer):
@@ -425,11 +475,12 @@ class MotionLayers:
     label: LabelLayer | None = None
     points: MotionLayer | None = None
     objects: MotionLayer | None = None
+    certainty: CertaintyLayer | None = None
 
     @property
     def layers(self) -> list[MotionLayer]:
         """All but the label."""
-        every = (self.body, self.feet, self.points, self.objects)
+        every = (self.body, self.feet, self.points, self.objects, self.certainty)
         return [layer for layer in every if layer is not None]
 
     @property

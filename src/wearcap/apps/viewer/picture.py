@@ -22,7 +22,7 @@ from torch import Tensor
 
 from wearcap.apps.viewer.camera_path import KEY_S, azimuths, smoothed
 from wearcap.apps.viewer.ground import Ground
-from wearcap.apps.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body
+from wearcap.apps.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body, vertex_colors
 from wearcap.body.contact_points import contact_points
 from wearcap.body.kinematics import site_positions
 from wearcap.body.model import BodyModel
@@ -77,7 +77,8 @@ class _Actor:
         """Body, marks of feet in contact, contact points (without them: marks of hands in contact)."""
         T = self.motion.T_world_joint[frame]
         vertices = self.body.vertices(T).detach().numpy().astype(np.float32)
-        body = Mesh(vertices, self.body.faces.numpy().astype(np.int32), self.color.astype(np.float32), smooth=True)
+        color = vertex_colors(self.body, self.motion, frame, self.color).astype(np.float32)
+        body = Mesh(vertices, self.body.faces.numpy().astype(np.int32), color, smooth=True)
         palms = tuple(f"{side}_palm" for side in HANDS)
         feet = self._marks(T, FOOT_PATCHES, self.motion.contact_prob, frame, 0.028, CONTACT_COLOR)
         if self.motion.body_contact_prob is None:

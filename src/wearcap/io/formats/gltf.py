@@ -2,7 +2,7 @@
 
 One node per joint, with wearcap's axes and offsets, below a node that turns z up into glTF's y up. The inverse bind
 matrices undo the rest pose with the root at the origin, the pose of a body's vertices. Without a body model, sticks stand
-for its bones.
+for its bones. How sure the motion is of its joints lies in the animation's `extras`.
 """
 
 import json
@@ -124,9 +124,21 @@ def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -
         "meshes": [{"name": "body", "primitives": [figure.primitive(shown)]}],
         "materials": [_MATERIAL],
         "skins": [skin],
-        "animations": [{"name": "motion", "samplers": figure.samplers, "channels": figure.channels}],
+        "animations": [
+            {"name": "motion", "samplers": figure.samplers, "channels": figure.channels} | _certainty(motion)
+        ],
     }
     figure.write(path, document)
+
+
+def _certainty(motion: Motion) -> dict[str, Any]:
+    """`extras` with how sure the motion is of its joints, which glTF has no place for: whole millimetres of `joint_std` by joint, one for
+    each key frame of the rotations, and `joint_dof`; nothing of a motion that does not say."""
+    if motion.joint_std is None:
+        return {}
+    columns = (1000 * motion.joint_std.T).round().int().tolist()
+    by_joint = dict(zip(motion.skeleton.joint_names, columns))
+    return {"extras": {"joint_std_mm": by_joint, "joint_dof": motion.joint_dof}}
 
 
 def _quat_xyzw(R: Float[Tensor, "element 3 3"]) -> Float32[np.ndarray, "element 4"]:

@@ -111,6 +111,8 @@ def _check(motion: Motion, path: str | Path) -> None:
             raise WearcapError(f"array {name!r} has shape {tuple(value.shape)}", path, f"{size} in the second place")
     if interactions is not None and {len(interactions.objects), len(interactions.classes)} != {len(interactions)}:
         raise ValueError(f"names that do not match {len(interactions)} interactions")
+    if motion.joint_dof is not None and not 0 < motion.joint_dof < np.inf:
+        raise ValueError(f"{motion.joint_dof} degrees of freedom")
     for site in skeleton.sites.values():
         skeleton.index(site.joint)
         if not np.isfinite(site.t_joint_site).all():

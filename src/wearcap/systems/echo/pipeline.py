@@ -101,6 +101,7 @@ class Echo(LearnedSystem):
 
     name = "echo"
     pipeline = "echo"
+    sampled = "ablation/echo_conveyor"
     experiment = "experiment=echo"
     shared = ("echo",)
     required = (HEAD, TRACKED_WRISTS, HEIGHT)

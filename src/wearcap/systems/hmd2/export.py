@@ -93,6 +93,7 @@ def exports(pipeline: HMD2) -> Exports:
         "image_encoder": conditions.get("image", {}).get("encoder"),
         "grid": conditions.get("points", {}).get("grid"),
         "skeleton": graphs.skeleton_to_json(model.skeleton),
+        "joint_dof": model.joint_dof,
     }
     return Exports("hmd2", made, about)
 
@@ -161,6 +162,7 @@ class Sidecar(msgspec.Struct):
     image_encoder: str | None = None
     grid: VoxelGrid | None = None
     refinement: dict[str, Any] | None = None
+    joint_dof: graphs.Rate | None = None
 
     def others(self) -> dict[str, Exported]:
         """The conditions beside the head; files of before have those of points and images apart."""
@@ -177,7 +179,8 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
     """The pipeline of an exported model."""
     conditions = {name: CONDITIONS[name].of_export(entry, runs) for name, entry in about.others().items()}
     schedule, skeleton = graphs.schedule_from_json(about.schedule), about.skeleton.skeleton()
-    model = DiffusionModel(_ExportedDenoiser(runs, about), about.features, schedule, skeleton, about.fps, conditions)
+    parts = about.features, schedule, skeleton, about.fps, conditions, about.joint_dof
+    model = DiffusionModel(_ExportedDenoiser(runs, about), *parts)
     sampling, overlap = (msgspec.convert(about.settings, kind) for kind in (Sampling, Overlap))
     live, use = bool(about.settings["live"]), tuple(about.settings["use"])
     return HMD2(model, sampling, overlap, use, Refinement.of(about.refinement), live)

@@ -79,6 +79,7 @@ class HMD2(LearnedSystem):
 
     name = "hmd2"
     pipeline = "hmd2"
+    sampled = "ablation/hmd2_sampled"
     experiment = "experiment=hmd2"
     shared = ("hmd2",)
     required = (HEAD, POINTS, HEIGHT)
@@ -274,7 +275,8 @@ class HMD2(LearnedSystem):
             "lookahead": str(self.lookahead_frames),
             "refinement": str(self.refinement),
         }
-        return anchored_to_head(final.motion(skeleton, settings, self.model.features.contacts), final.T_world_head)
+        motion = final.motion(skeleton, settings, self.model.features.contacts)
+        return anchored_to_head(replace(motion, joint_dof=self.model.joint_dof), final.T_world_head)
 
 
 def _bridged(motion: Motion, stretches: tuple[tuple[int, int], ...]) -> Motion:

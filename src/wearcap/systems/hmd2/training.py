@@ -82,7 +82,7 @@ class MotionDiffusion(Training):
         conditions: Mapping[str, Mapping[str, Any]] | None = None,
     ):
         """`conditions`: settings of those of `CONDITIONS` that the network has beside the head's path, by name."""
-        super().__init__(optimization, loss.weights)
+        super().__init__(optimization, loss.weights, spread=features.spread)
         given = {name: CONDITIONS[name](**settings) for name, settings in (conditions or {}).items()}
         self.net = net(
             motion_size=features.motion_size,
@@ -98,7 +98,7 @@ class MotionDiffusion(Training):
         self.register_buffer("_feet", torch.tensor(feet), persistent=False)
 
     def pipeline_parts(self) -> dict[str, DiffusionModel]:
-        parts = self.features, self.schedule, self.skeleton, self.fps, self.given
+        parts = self.features, self.schedule, self.skeleton, self.fps, self.given, self.fitted_dof
         return {"model": DiffusionModel(self.net, *parts)}
 
     def set_statistics(self, dataset: Windows, limit: int = 2000) -> None:

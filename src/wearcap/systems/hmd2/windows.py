@@ -36,6 +36,8 @@ class DiffusionModel:
     fps: float
     conditions: Mapping[str, Condition] = field(default_factory=dict)
     """The network's conditions beside the head, in its order."""
+    joint_dof: float | None = None
+    """As of the motions that are captured."""
 
 
 class Frames(NamedTuple):

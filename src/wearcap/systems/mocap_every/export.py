@@ -30,6 +30,7 @@ def exports(pipeline: MocapEvery) -> Exports:
         "motion_size": features.motion_size,
         "window": net.window,
         "fps": pipeline.model.fps,
+        "joint_dof": pipeline.model.joint_dof,
         "skeleton": skeleton_to_json(pipeline.model.skeleton),
         "settings": pipeline.settings(),
         "refinement": None if pipeline.refinement is None else asdict(pipeline.refinement),
@@ -58,12 +59,13 @@ class Sidecar(msgspec.Struct):
     skeleton: SkeletonEntry
     settings: dict[str, int | float | str | bool]
     refinement: dict[str, Any] | None = None
+    joint_dof: Rate | None = None
 
 
 def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: Sidecar) -> MocapEvery:
     """The pipeline of an exported model."""
     net = _ExportedEstimator(runs["model"], about.window)
-    model = WatchModel(net, about.features, about.skeleton.skeleton(), about.fps)
+    model = WatchModel(net, about.features, about.skeleton.skeleton(), about.fps, about.joint_dof)
     own = {name: about.settings[name] for name in ("floor", "carried", "anchor")}
     return MocapEvery(
         model, msgspec.convert(about.settings, Overlap), refinement=Refinement.of(about.refinement), **own

@@ -57,6 +57,8 @@ class WatchModel:
     """Skeleton for recordings without their own."""
     fps: float
     """Frame rate of the estimator (Hz)."""
+    joint_dof: float | None = None
+    """As of the motions that are captured."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,8 @@ class MocapEvery(LearnedSystem):
     def motion(self, final: FinalPoses, skeleton: Skeleton) -> Motion:
         """Step 4: estimated poses as a motion, anchored to the measured head."""
         about = self.settings() | {"refinement": self.refinement}
-        motion = final.motion(skeleton, {"pipeline": "mocap_every"} | {name: str(about[name]) for name in about})
+        settings = {"pipeline": "mocap_every"} | {name: str(about[name]) for name in about}
+        motion = replace(final.motion(skeleton, settings), joint_dof=self.model.joint_dof)
         return anchored_to_head(motion, final.T_world_head) if self.anchor else motion
 
     def _follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:

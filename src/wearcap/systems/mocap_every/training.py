@@ -48,7 +48,7 @@ class WatchRegression(Training):
     ):
         """`end_weight`: weight of hands and feet relative to the other joints in "position". `contact_share`: share of
         the labels with contact, by which both classes weigh alike in "contact"; None: plain cross entropy."""
-        super().__init__(optimization, loss_weights)
+        super().__init__(optimization, loss_weights, spread=features.spread)
         self.net = net(feature_size=features.size, motion_size=features.motion_size)
         self.features, self.skeleton, self.fps = features, skeleton, fps
         self.contact_share = contact_share
@@ -60,7 +60,7 @@ class WatchRegression(Training):
         self.register_buffer("_joint_weights", weights / weights.mean(), persistent=False)
 
     def pipeline_parts(self) -> dict[str, WatchModel]:
-        return {"model": WatchModel(self.net, self.features, self.skeleton, self.fps)}
+        return {"model": WatchModel(self.net, self.features, self.skeleton, self.fps, self.fitted_dof)}
 
     def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
         (batch,) = drawn_batches(dataset, limit)

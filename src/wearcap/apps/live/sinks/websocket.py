@@ -3,6 +3,7 @@
 The first message of a client describes each wearer: {"skeleton": {"wearer", "joints", "parents", "offsets"}, "fps"}; every
 frame follows as {"wearer", "time", "root": [x, y, z], "rotations_wxyz": [[w, x, y, z], …], "contact": [0…1 of left heel,
 left toe tip, right heel, right toe tip] or null}: rotations relative to the parent joint, in wearcap's axes (z up, metres).
+Frames of a system that says how sure it is of each joint also have {"joint_std": [m, …], "joint_dof": number or null}, as a Motion.
 Frames with objects also have "objects": {NAME: {"position": [x, y, z], "rotation_wxyz": [w, x, y, z], "contact": 0…1 or
 null}}: the pose of the object's mesh in the world, and the largest probability that a point of the body touches it.
 """
@@ -161,6 +162,8 @@ def _frame(wearer: str, motion: Motion, k: int, objects: dict[str, SeenObject]) 
         "rotations_wxyz": [[round(each, 6) for each in row] for row in wxyz.tolist()],
         "contact": None if contact is None else [round(each, 3) for each in contact[k].tolist()],
     }
+    if motion.joint_std is not None:
+        frame |= {"joint_std": [round(each, 4) for each in motion.joint_std[k].tolist()], "joint_dof": motion.joint_dof}
     if objects:
         frame["objects"] = {name: _row(seen) for name, seen in objects.items()}
     return json.dumps(frame)
