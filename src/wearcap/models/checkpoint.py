@@ -150,11 +150,19 @@ def load_network(path: str | Path, kind: type[Network], experiment: str, *, part
     return network
 
 
-def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float32") -> None:
+def share_checkpoint(
+    source: str | Path,
+    target: str | Path,
+    dtype: str = "float32",
+    *,
+    start: str | Path | None = None,
+    share: float = 1.0,
+) -> None:
     """Write a shareable file of a checkpoint: averaged weights, statistics, the model's config, names of the data, and
     what the training took.
 
-    Weights of two or more axes are stored as `dtype` (of `DTYPES`); biases, norms and statistics stay as they are.
+    Weights of two or more axes are stored as `dtype` (of `DTYPES`); biases, norms and statistics stay as they are. With
+    `start`, the checkpoint that the training started from, all lie a `share` of the way from that one's (Wortsman et al. 2022).
     Folders of this machine are left out. Raises WearcapError for a source that `read_checkpoint` refuses, a target
     that is no `.safetensors` file, and weights that are not finite in that type.
     """
@@ -163,6 +171,9 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
     if dtype not in DTYPES:
         raise WearcapError(f"no dtype {dtype!r}", expected=f"one of {', '.join(DTYPES)}", fix=nearest(dtype, DTYPES))
     config, state = read_checkpoint(source)
+    if start is not None:
+        before = read_checkpoint(start)[1]
+        state = {name: torch.lerp(before[name], v, share) if v.is_floating_point() else v for name, v in state.items()}
     narrow = {
         name: value.to(DTYPES[dtype]) if value.dtype == torch.float32 and value.ndim > 1 else value
         for name, value in state.items()

@@ -1,0 +1,186 @@
+"""`wearcap adapt`: a checkpoint goes on training on one wearer's motion, as far as that helps on motion that is held out."""
+
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from rich import print as show
+
+from data_prep.shared.mocap import MOCAP, About, mocap_recording
+from wearcap.body.skeletons import xsens23
+from wearcap.cli.conf import compose, conf_dir, hydra_main, load_pipeline, require_writable
+from wearcap.cli.stated import stated
+from wearcap.cli.train import train
+from wearcap.errors import WearcapError
+from wearcap.evaluation.evaluate import evaluate
+from wearcap.io.conventions import Conventions
+from wearcap.metrics.table import aggregate
+from wearcap.models.checkpoint import read_checkpoint, share_checkpoint
+from wearcap.reading.any_file import sources
+from wearcap.recording import Recording, RecordingStore
+from wearcap.recording.store import MANIFEST
+from wearcap.recording.timing import between_seconds
+from wearcap.runtime.stages import digest
+from wearcap.runtime.system import LearnedSystem, System, training_of
+from wearcap.training.run import last_checkpoint
+
+PIECE_S = 5.0
+"""Length (s) that both pieces of a recording need for it to be cut where the held-out part begins; HMD²'s windows are 4 s."""
+WEARER = "wearer"
+
+
+def run(config: DictConfig) -> float:
+    """Adapt the config's checkpoint and write it; returns the main error on the held-out motion, which is below that before.
+
+    Raises WearcapError for a checkpoint or recordings that cannot be adapted with, and when nothing was gained: then nothing is written.
+    """
+    system, output = _system_of(config.checkpoint), Path(config.output)
+    if output.suffix != ".safetensors":
+        raise WearcapError(f"output={output}", expected="NAME.safetensors")
+    listed = config.recordings if isinstance(config.recordings, ListConfig) else [config.recordings]
+    recordings = [each for path in listed for each in true_recordings(Path(path), stated(config))]
+    require_one_wearer(recordings, config.least_s, config.similar)
+    folder = Path(config.paths.run)
+    store = _data_set(folder / WEARER, *parted(recordings, config.held_out))
+    training = _training(config, store, folder)
+    shown = [name for name, source in training.data.sources.items() if source and name != WEARER]
+    show(f"the wearer's motion beside that of {', '.join(shown) or 'nobody: the training’s own data sets are not here'}")
+    train(training)
+    pipeline = compose("evaluate", [f"pipeline={system.pipeline}"]).pipeline
+    trained, errors = last_checkpoint(folder), dict[Path, float]()
+    for distance in (0.0, *config.distances):
+        candidate = folder / f"{distance:g}.safetensors"
+        share_checkpoint(trained, candidate, start=config.checkpoint, share=distance)
+        errors[candidate], metric = _error(load_pipeline(candidate, pipeline, config.device), store)
+        show(f"{metric} on the held-out part, {distance:.0%} of the way: {errors[candidate]:.2f}")
+    before, best = errors[folder / "0.safetensors"], min(errors, key=errors.__getitem__)
+    if not errors[best] < before:
+        what = f"nothing was gained on the held-out part ({metric} {before:.2f} before, {min(list(errors.values())[1:]):.2f} after), and nothing is written"
+        raise WearcapError(what, config.checkpoint, fix="Give more of the wearer's motion, or keep the checkpoint as it is.")
+    require_writable(output, "output")
+    share_checkpoint(best, output)
+    show(f"checkpoint: {output}, {metric} {before:.2f} before, {errors[best]:.2f} after")
+    return errors[best]
+
+
+def _system_of(checkpoint: str) -> type[System]:
+    training, system = training_of(checkpoint)
+    if system is None or not issubclass(system, LearnedSystem) or system.pipeline is None:
+        raise WearcapError(f"{training} is not adapted to wearers", checkpoint, "a checkpoint of HMD², MocapEvery or ECHO")
+    return system
+
+
+def true_recordings(path: Path, how: Conventions) -> list[Recording]:
+    """The recordings of a path with their true motion at 60 Hz, on `xsens23` of the wearer's own bones, and a device on the head.
+
+    A prepared one stays as it is; of a suit's or a file's motion, head, floor and contacts are derived (`mocap_recording`).
+    Raises WearcapError for what cannot be read, has no true motion, or has limbs that are not recognised.
+    """
+    found = []
+    for name, load in sources(path, how).items():
+        recording = load().recording
+        motion, head = recording.motion or recording.suit, recording.head
+        if motion is None or len(motion) < 2:
+            expected = "what a suit (MVNX) or motion capture (BVH) measured, or a prepared recording with true motion"
+            raise WearcapError(f"recording {name!r} has no true motion to learn from", path, expected)
+        ready = recording.motion is not None and head is not None and len(head.timestamps) == len(motion)
+        if not ready or motion.skeleton.joint_names != xsens23().joint_names or abs(motion.fps - MOCAP.fps) > 0.5:
+            about = About(recording.name, recording.subject, recording.source, recording.license, recording.activity)
+            recording = mocap_recording(motion, about, MOCAP)
+        found.append(recording)
+    return found
+
+
+def require_one_wearer(recordings: list[Recording], least_s: float, similar: float) -> None:
+    """Raise WearcapError for less motion than `least_s` (s), and for statures that differ by more than the share `similar`."""
+    if (found := sum(each.duration_s for each in recordings)) < least_s:
+        what, fix = f"{found:.0f} s of motion are too little", "About two minutes of varied activity do well."
+        raise WearcapError(what, expected=f"{least_s:g} s at least", fix=fix)
+    statures = {each.motion.skeleton.height_of("head"): each.name for each in recordings if each.motion}
+    if max(statures) > (1 + similar) * min(statures):
+        what = "; ".join(f"the head is {each:.2f} m high in {statures[each]}" for each in (min(statures), max(statures)))
+        raise WearcapError(f"recordings on several people's skeletons: {what}", expected="recordings of one wearer")
+
+
+def parted(recordings: list[Recording], held_out: float) -> tuple[list[Recording], list[Recording]]:
+    """Recordings to learn from, and the last ones, of about the share `held_out` of the time; a long one between is cut."""
+    learnt, left = [], (1 - held_out) * sum(each.duration_s for each in recordings)
+    for number, each in enumerate(recordings):
+        if left < each.duration_s:
+            if min(left, each.duration_s - left) >= PIECE_S:
+                learnt.append(between_seconds(each, 0, left))
+                rest = [between_seconds(each, left, each.duration_s + 1)]
+            elif left > each.duration_s / 2 or not learnt:
+                learnt, rest = [*learnt, each], []
+            else:
+                rest = [each]
+            return learnt, [*rest, *recordings[number + 1 :]]
+        learnt.append(each)
+        left -= each.duration_s
+    return learnt, []
+
+
+def _data_set(folder: Path, learnt: list[Recording], held_out: list[Recording]) -> RecordingStore:
+    """The wearer's data set, in the order of the recordings. Raises WearcapError where nothing is held out."""
+    if not held_out:
+        raise WearcapError("nothing is held out of a recording as short as this", fix="Give further recordings, or held_out=0.4.")
+    shutil.rmtree(folder, ignore_errors=True)
+    store = RecordingStore(folder)
+    for split, recordings in (("train", learnt), ("val", held_out)):
+        for number, each in enumerate(recordings):
+            named = replace(each, name=f"{split}_{number:03}_{each.name}", scene=None, environment=None, camera=None)
+            store.add(named, split=split, config_hash="")
+    return store
+
+
+def _training(config: DictConfig, store: RecordingStore, folder: Path) -> DictConfig:
+    """The training of the checkpoint's system, from its weights, with the wearer's windows among its own."""
+    about, _ = read_checkpoint(config.checkpoint)
+    if "dataset" in (about.get("data") or {}):
+        base: Any = OmegaConf.create({name: value for name, value in about.items() if name != "training"})
+    else:
+        base = compose("train", [f"experiment={_experiment(about, config.checkpoint)}"])
+    OmegaConf.set_struct(base, False)
+    model = about["model"]
+    base.merge_with(OmegaConf.to_container(config.train, resolve=True))
+    base.model = model | {"optimization": {"_target_": "wearcap.training.base.Optimization", **base.optimizer}}
+    base.init, base.paths = config.checkpoint, {**config.paths, "run": str(folder)}
+    base.wearer = {"recordings": digest(sorted(each.sha256 for each in store.entries.values()))}
+    content = base.data.dataset.content
+    if "conditions" in content:
+        content.conditions = {name: content.conditions[name] for name in model["conditions"]}
+        for name, condition in model["conditions"].items():
+            if {"encoder", "size"} <= set(condition):
+                content.conditions[name].update({key: condition[key] for key in ("encoder", "size")})
+    here = {name: each for name, each in base.data.sources.items() if each and (Path(each.root) / MANIFEST).is_file()}
+    others = sum(each.weight for each in here.values())
+    wearer = {"root": str(store.root), "bodies": False}
+    wearer["weight"] = config.share / (1 - config.share) * others if here else 1.0
+    base.data.sources = here | {WEARER: wearer}
+    base.data.val_sources = {WEARER: wearer | {"weight": 1.0}}
+    return base
+
+
+def _experiment(about: dict[str, Any], checkpoint: str) -> str:
+    """The experiment that trained a shared checkpoint, by the name of its training."""
+    root = conf_dir() / "experiment"
+    for file in sorted(root.rglob("*.yaml")):
+        named = re.search(r"^name: (\S+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+        if named and named[1] == about.get("name"):
+            return file.relative_to(root).with_suffix("").as_posix()
+    expected = "a shared checkpoint of one, or a run's .ckpt"
+    raise WearcapError(f"no experiment trains {str(about.get('name'))[:80]!r}", checkpoint, expected)
+
+
+def _error(system: System, store: RecordingStore) -> tuple[float, str]:
+    """The main error on the held-out recordings, and its name."""
+    scores = aggregate(list(evaluate(system, store, store.names("val"), [0])))
+    metric = next(iter(scores))
+    return scores[metric].mean, metric
+
+
+def main(arguments: list[str]) -> None:
+    hydra_main("adapt", run, arguments)
