@@ -76,6 +76,17 @@ def test_a_shared_checkpoint_is_the_weights_and_what_others_need_of_the_config(t
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "shared.safetensors").read_bytes()
 
 
+def test_weights_between_the_start_of_a_training_and_its_end(tmp_path):
+    counted = {"count": torch.tensor([7])}
+    start = run_file(tmp_path / "start.ckpt", {"weight": torch.full((2, 2), 1.0), "mean": torch.zeros(3)} | counted)
+    end = run_file(tmp_path / "end.ckpt", {"weight": torch.full((2, 2), 3.0), "mean": torch.ones(3)} | counted)
+    share_checkpoint(end, tmp_path / "shared.safetensors", start=start, share=0.25)
+    state = read_checkpoint(tmp_path / "shared.safetensors")[1]
+    assert torch.equal(state["weight"], torch.full((2, 2), 1.5))
+    assert torch.equal(state["mean"], torch.full((3,), 0.25))
+    assert torch.equal(state["count"], counted["count"])
+
+
 def test_folders_of_a_machine_stay_at_home(tmp_path):
     source = run_file(tmp_path / "run.ckpt", data={"sources": {"own": {"root": "/home/someone/data"}}})
     share_checkpoint(source, tmp_path / "shared.safetensors")

@@ -139,22 +139,30 @@ def _data_set(folder: Path, learnt: list[Recording], held_out: list[Recording]) 
 def _training(config: DictConfig, store: RecordingStore, folder: Path) -> DictConfig:
     """The training of the checkpoint's system, from its weights, with the wearer's windows among its own."""
     about, _ = read_checkpoint(config.checkpoint)
-    if "dataset" in (about.get("data") or {}):
-        base: Any = OmegaConf.create({name: value for name, value in about.items() if name != "training"})
-    else:
-        base = compose("train", [f"experiment={_experiment(about, config.checkpoint)}"])
+    model, own = about["model"], about.get("data") or {}
+    experiment = [] if "dataset" in own else [f"experiment={_experiment(about, config.checkpoint)}"]
+    base: Any = compose("train", [*experiment, "callbacks=averaged"])
     OmegaConf.set_struct(base, False)
-    model = about["model"]
-    base.merge_with(OmegaConf.to_container(config.train, resolve=True))
-    base.model = model | {"optimization": {"_target_": "wearcap.training.base.Optimization", **base.optimizer}}
+    if not experiment:
+        base.data, base.name = own, about["name"]
+    changes: Any = OmegaConf.to_container(config.train, resolve=True)
+    base.optimizer = changes.pop("optimizer")  # in place of the training's own, which may be of another kind
+    base.merge_with(changes)
+    base.model = model | {"optimization": base.optimizer}
     base.init, base.paths = config.checkpoint, {**config.paths, "run": str(folder)}
     base.wearer = {"recordings": digest(sorted(each.sha256 for each in store.entries.values()))}
-    content = base.data.dataset.content
-    if "conditions" in content:
-        content.conditions = {name: content.conditions[name] for name in model["conditions"]}
-        for name, condition in model["conditions"].items():
-            if {"encoder", "size"} <= set(condition):
-                content.conditions[name].update({key: condition[key] for key in ("encoder", "size")})
+    content: Any = OmegaConf.to_container(base.data.dataset.content, resolve=True)
+    if "conditions" in content:  # in the model's order; embeddings, which the wearer's recordings need not have, as it takes them
+        taken = {
+            name: {key: each[key] for key in ("encoder", "size")} if "size" in each else {}
+            for name, each in model["conditions"].items()
+        }
+        content["conditions"] = {name: content["conditions"][name] | settings for name, settings in taken.items()}
+        base.surroundings = {}
+    base.data.dataset.content = content
+    loading, validations = base.data.loading, -(-config.steps // base.data.loading.steps_per_epoch)
+    loading.steps_per_epoch = -(-config.steps // validations)  # the last step, too, is followed by a validation and a checkpoint
+    base.trainer.max_steps = validations * loading.steps_per_epoch
     here = {name: each for name, each in base.data.sources.items() if each and (Path(each.root) / MANIFEST).is_file()}
     others = sum(each.weight for each in here.values())
     wearer = {"root": str(store.root), "bodies": False}
