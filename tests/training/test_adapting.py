@@ -55,7 +55,14 @@ def test_it_is_better_on_what_was_held_out_and_goes_on_where_it_was_killed(check
     run = tmp_path / "me.safetensors.run"
     errors = {}
     for path in (checkpoint, output):
-        given = [f"checkpoint={path}", f"dataset={run / 'wearer'}", "split=val", "seeds=[0]", "baselines=false", "jobs=1"]
+        given = [
+            f"checkpoint={path}",
+            f"dataset={run / 'wearer'}",
+            "split=val",
+            "seeds=[0]",
+            "baselines=false",
+            "jobs=1",
+        ]
         scores = evaluate.run(compose("evaluate", [*given, f"output={tmp_path / 't.json'}", f"paths.run={tmp_path}"]))
         errors[path] = scores["wearcap"]["mpjpe_cm"].mean
     assert errors[output] < 0.9 * errors[checkpoint]

@@ -1,6 +1,5 @@
 """`wearcap adapt`: a checkpoint goes on training on one wearer's motion, as far as that helps on motion that is held out."""
 
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from rich import print as show
 
 from data_prep.shared.mocap import MOCAP, About, mocap_recording
 from wearcap.body.skeletons import xsens23
-from wearcap.cli.conf import compose, conf_dir, hydra_main, load_pipeline, require_writable
+from wearcap.cli.conf import compose, hydra_main, load_pipeline
 from wearcap.cli.stated import stated
 from wearcap.cli.train import train
 from wearcap.errors import WearcapError
@@ -40,14 +39,16 @@ def run(config: DictConfig) -> float:
     system, output = _system_of(config.checkpoint), Path(config.output)
     if output.suffix != ".safetensors":
         raise WearcapError(f"output={output}", expected="NAME.safetensors")
-    listed = config.recordings if isinstance(config.recordings, ListConfig) else [config.recordings]
-    recordings = [each for path in listed for each in true_recordings(Path(path), stated(config))]
+    paths = config.recordings if isinstance(config.recordings, ListConfig) else [config.recordings]
+    recordings = [each for path in paths for each in true_recordings(Path(path), stated(config))]
     require_one_wearer(recordings, config.least_s, config.similar)
     folder = Path(config.paths.run)
     store = _data_set(folder / WEARER, *parted(recordings, config.held_out))
-    training = _training(config, store, folder)
-    shown = [name for name, source in training.data.sources.items() if source and name != WEARER]
-    show(f"the wearer's motion beside that of {', '.join(shown) or 'nobody: the training’s own data sets are not here'}")
+    training = _training(config, system, store, folder)
+    others = [name for name, source in training.data.sources.items() if source and name != WEARER]
+    show(
+        f"the wearer's windows are mixed with those of: {', '.join(others) or 'nothing, for no data set of it is here'}"
+    )
     train(training)
     pipeline = compose("evaluate", [f"pipeline={system.pipeline}"]).pipeline
     trained, errors = last_checkpoint(folder), dict[Path, float]()
@@ -58,9 +59,8 @@ def run(config: DictConfig) -> float:
         show(f"{metric} on the held-out part, {distance:.0%} of the way: {errors[candidate]:.2f}")
     before, best = errors[folder / "0.safetensors"], min(errors, key=errors.__getitem__)
     if not errors[best] < before:
-        what = f"nothing was gained on the held-out part ({metric} {before:.2f} before, {min(list(errors.values())[1:]):.2f} after), and nothing is written"
-        raise WearcapError(what, config.checkpoint, fix="Give more of the wearer's motion, or keep the checkpoint as it is.")
-    require_writable(output, "output")
+        what = f"nothing was gained on the held-out part ({metric} {before:.2f} before), and nothing is written"
+        raise WearcapError(what, config.checkpoint, fix="Give more motion of the wearer, or keep the checkpoint.")
     share_checkpoint(best, output)
     show(f"checkpoint: {output}, {metric} {before:.2f} before, {errors[best]:.2f} after")
     return errors[best]
@@ -69,7 +69,8 @@ def run(config: DictConfig) -> float:
 def _system_of(checkpoint: str) -> type[System]:
     training, system = training_of(checkpoint)
     if system is None or not issubclass(system, LearnedSystem) or system.pipeline is None:
-        raise WearcapError(f"{training} is not adapted to wearers", checkpoint, "a checkpoint of HMD², MocapEvery or ECHO")
+        expected = "a checkpoint of HMD², MocapEvery or ECHO"
+        raise WearcapError(f"{training} is not adapted to wearers", checkpoint, expected)
     return system
 
 
@@ -101,32 +102,30 @@ def require_one_wearer(recordings: list[Recording], least_s: float, similar: flo
         raise WearcapError(what, expected=f"{least_s:g} s at least", fix=fix)
     statures = {each.motion.skeleton.height_of("head"): each.name for each in recordings if each.motion}
     if max(statures) > (1 + similar) * min(statures):
-        what = "; ".join(f"the head is {each:.2f} m high in {statures[each]}" for each in (min(statures), max(statures)))
+        apart = sorted(statures)[:: len(statures) - 1]
+        what = "; ".join(f"the head is {each:.2f} m high in {statures[each]}" for each in apart)
         raise WearcapError(f"recordings on several people's skeletons: {what}", expected="recordings of one wearer")
 
 
 def parted(recordings: list[Recording], held_out: float) -> tuple[list[Recording], list[Recording]]:
     """Recordings to learn from, and the last ones, of about the share `held_out` of the time; a long one between is cut."""
-    learnt, left = [], (1 - held_out) * sum(each.duration_s for each in recordings)
-    for number, each in enumerate(recordings):
-        if left < each.duration_s:
-            if min(left, each.duration_s - left) >= PIECE_S:
-                learnt.append(between_seconds(each, 0, left))
-                rest = [between_seconds(each, left, each.duration_s + 1)]
-            elif left > each.duration_s / 2 or not learnt:
-                learnt, rest = [*learnt, each], []
-            else:
-                rest = [each]
-            return learnt, [*rest, *recordings[number + 1 :]]
-        learnt.append(each)
-        left -= each.duration_s
-    return learnt, []
+    learnt, kept, left = [], [], (1 - held_out) * sum(each.duration_s for each in recordings)
+    for each in recordings:
+        length = each.duration_s
+        if min(left, length - left) >= PIECE_S:
+            learnt.append(between_seconds(each, 0, left))
+            kept.append(between_seconds(each, left, length + 1))
+        else:
+            (learnt if left >= length / 2 or not learnt else kept).append(each)
+        left -= length
+    return learnt, kept
 
 
 def _data_set(folder: Path, learnt: list[Recording], held_out: list[Recording]) -> RecordingStore:
     """The wearer's data set, in the order of the recordings. Raises WearcapError where nothing is held out."""
     if not held_out:
-        raise WearcapError("nothing is held out of a recording as short as this", fix="Give further recordings, or held_out=0.4.")
+        fix = "Give further recordings, or held_out=0.4."
+        raise WearcapError("nothing is held out of a recording as short as this", fix=fix)
     shutil.rmtree(folder, ignore_errors=True)
     store = RecordingStore(folder)
     for split, recordings in (("train", learnt), ("val", held_out)):
@@ -136,15 +135,15 @@ def _data_set(folder: Path, learnt: list[Recording], held_out: list[Recording]) 
     return store
 
 
-def _training(config: DictConfig, store: RecordingStore, folder: Path) -> DictConfig:
+def _training(config: DictConfig, system: type[System], store: RecordingStore, folder: Path) -> DictConfig:
     """The training of the checkpoint's system, from its weights, with the wearer's windows among its own."""
     about, _ = read_checkpoint(config.checkpoint)
     model, own = about["model"], about.get("data") or {}
-    experiment = [] if "dataset" in own else [f"experiment={_experiment(about, config.checkpoint)}"]
-    base: Any = compose("train", [*experiment, "callbacks=averaged"])
+    base: Any = compose("train", [str(system.experiment), "callbacks=averaged"])
     OmegaConf.set_struct(base, False)
-    if not experiment:
-        base.data, base.name = own, about["name"]
+    base.name = about.get("name", base.name)
+    if "dataset" in own:  # a run's own checkpoint: what it was trained on, and how
+        base.data = own
     changes: Any = OmegaConf.to_container(config.train, resolve=True)
     base.optimizer = changes.pop("optimizer")  # in place of the training's own, which may be of another kind
     base.merge_with(changes)
@@ -152,35 +151,26 @@ def _training(config: DictConfig, store: RecordingStore, folder: Path) -> DictCo
     base.init, base.paths = config.checkpoint, {**config.paths, "run": str(folder)}
     base.wearer = {"recordings": digest(sorted(each.sha256 for each in store.entries.values()))}
     content: Any = OmegaConf.to_container(base.data.dataset.content, resolve=True)
-    if "conditions" in content:  # in the model's order; embeddings, which the wearer's recordings need not have, as it takes them
-        taken = {
-            name: {key: each[key] for key in ("encoder", "size")} if "size" in each else {}
-            for name, each in model["conditions"].items()
+    if "conditions" in content:
+        # In the model's order; embeddings, which no recording needs to have, as it takes them
+        windows, given = content["conditions"], model["conditions"]
+        sized = {
+            name: {key: each[key] for key in ("encoder", "size") if "size" in each} for name, each in given.items()
         }
-        content["conditions"] = {name: content["conditions"][name] | settings for name, settings in taken.items()}
+        content["conditions"] = {name: windows[name] | settings for name, settings in sized.items()}
         base.surroundings = {}
     base.data.dataset.content = content
+    # The last step, too, is followed by a validation, which leaves a checkpoint.
     loading, validations = base.data.loading, -(-config.steps // base.data.loading.steps_per_epoch)
-    loading.steps_per_epoch = -(-config.steps // validations)  # the last step, too, is followed by a validation and a checkpoint
+    loading.steps_per_epoch = -(-config.steps // validations)
     base.trainer.max_steps = validations * loading.steps_per_epoch
     here = {name: each for name, each in base.data.sources.items() if each and (Path(each.root) / MANIFEST).is_file()}
-    others = sum(each.weight for each in here.values())
-    wearer = {"root": str(store.root), "bodies": False}
-    wearer["weight"] = config.share / (1 - config.share) * others if here else 1.0
-    base.data.sources = here | {WEARER: wearer}
-    base.data.val_sources = {WEARER: wearer | {"weight": 1.0}}
+    total = sum(each.weight for each in here.values())
+    for each in here.values():
+        each.weight *= (1 - config.share) / total
+    wearer = {"root": str(store.root), "weight": config.share, "bodies": False}
+    base.data.sources, base.data.val_sources = here | {WEARER: wearer}, {WEARER: wearer}
     return base
-
-
-def _experiment(about: dict[str, Any], checkpoint: str) -> str:
-    """The experiment that trained a shared checkpoint, by the name of its training."""
-    root = conf_dir() / "experiment"
-    for file in sorted(root.rglob("*.yaml")):
-        named = re.search(r"^name: (\S+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
-        if named and named[1] == about.get("name"):
-            return file.relative_to(root).with_suffix("").as_posix()
-    expected = "a shared checkpoint of one, or a run's .ckpt"
-    raise WearcapError(f"no experiment trains {str(about.get('name'))[:80]!r}", checkpoint, expected)
 
 
 def _error(system: System, store: RecordingStore) -> tuple[float, str]:
