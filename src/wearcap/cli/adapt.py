@@ -1,4 +1,4 @@
-"""`wearcap adapt`: a checkpoint goes on training on one wearer's motion, as far as that helps on motion that is held out."""
+"""`wearcap adapt`: a checkpoint goes on training on one wearer's motion, as far as that helps on what is held out."""
 
 import shutil
 from dataclasses import replace
@@ -27,14 +27,14 @@ from wearcap.runtime.system import LearnedSystem, System, training_of
 from wearcap.training.run import last_checkpoint
 
 PIECE_S = 5.0
-"""Length (s) that both pieces of a recording need for it to be cut where the held-out part begins; HMD²'s windows are 4 s."""
+"""Least length (s) of both pieces of a recording that is cut where the held-out part begins; HMD²'s windows are 4 s."""
 WEARER = "wearer"
 
 
 def run(config: DictConfig) -> float:
-    """Adapt the config's checkpoint and write it; returns the main error on the held-out motion, which is below that before.
+    """Adapt the config's checkpoint and write it; returns its main error on the held-out motion.
 
-    Raises WearcapError for a checkpoint or recordings that cannot be adapted with, and when nothing was gained: then nothing is written.
+    Raises WearcapError for what cannot be adapted, and where nothing was gained: then nothing is written.
     """
     system, output = _system_of(config.checkpoint), Path(config.output)
     if output.suffix != ".safetensors":
@@ -55,7 +55,10 @@ def run(config: DictConfig) -> float:
     for distance in (0.0, *config.distances):
         candidate = folder / f"{distance:g}.safetensors"
         share_checkpoint(trained, candidate, start=config.checkpoint, share=distance)
-        errors[candidate], metric = _error(load_pipeline(candidate, pipeline, config.device), store)
+        adapted = load_pipeline(candidate, pipeline, config.device)
+        scores = aggregate(list(evaluate(adapted, store, store.names("val"), [0])))
+        metric, summary = next(iter(scores.items()))  # the main error
+        errors[candidate] = summary.mean
         show(f"{metric} on the held-out part, {distance:.0%} of the way: {errors[candidate]:.2f}")
     before, best = errors[folder / "0.safetensors"], min(errors, key=errors.__getitem__)
     if not errors[best] < before:
@@ -75,18 +78,18 @@ def _system_of(checkpoint: str) -> type[System]:
 
 
 def true_recordings(path: Path, how: Conventions) -> list[Recording]:
-    """The recordings of a path with their true motion at 60 Hz, on `xsens23` of the wearer's own bones, and a device on the head.
+    """The recordings of a path with true motion at 60 Hz, on `xsens23` of the wearer's own bones, and a device on the head.
 
-    A prepared one stays as it is; of a suit's or a file's motion, head, floor and contacts are derived (`mocap_recording`).
-    Raises WearcapError for what cannot be read, has no true motion, or has limbs that are not recognised.
+    Prepared ones stay as they are; of a suit's or a file's motion, head, floor and contacts are derived. Raises
+    WearcapError for what cannot be read, has no true motion, or has limbs that are not recognised.
     """
     found = []
     for name, load in sources(path, how).items():
         recording = load().recording
         motion, head = recording.motion or recording.suit, recording.head
         if motion is None or len(motion) < 2:
-            expected = "what a suit (MVNX) or motion capture (BVH) measured, or a prepared recording with true motion"
-            raise WearcapError(f"recording {name!r} has no true motion to learn from", path, expected)
+            expected = "motion of a suit (MVNX) or of motion capture (BVH), or a prepared recording with true motion"
+            raise WearcapError(f"recording {name!r} has no true motion", path, expected)
         ready = recording.motion is not None and head is not None and len(head.timestamps) == len(motion)
         if not ready or motion.skeleton.joint_names != xsens23().joint_names or abs(motion.fps - MOCAP.fps) > 0.5:
             about = About(recording.name, recording.subject, recording.source, recording.license, recording.activity)
@@ -96,7 +99,7 @@ def true_recordings(path: Path, how: Conventions) -> list[Recording]:
 
 
 def require_one_wearer(recordings: list[Recording], least_s: float, similar: float) -> None:
-    """Raise WearcapError for less motion than `least_s` (s), and for statures that differ by more than the share `similar`."""
+    """Raise WearcapError for less motion than `least_s` (s), and for heads whose heights differ by more than `similar`."""
     if (found := sum(each.duration_s for each in recordings)) < least_s:
         what, fix = f"{found:.0f} s of motion are too little", "About two minutes of varied activity do well."
         raise WearcapError(what, expected=f"{least_s:g} s at least", fix=fix)
@@ -108,7 +111,7 @@ def require_one_wearer(recordings: list[Recording], least_s: float, similar: flo
 
 
 def parted(recordings: list[Recording], held_out: float) -> tuple[list[Recording], list[Recording]]:
-    """Recordings to learn from, and the last ones, of about the share `held_out` of the time; a long one between is cut."""
+    """Recordings to learn from, and the last ones, about `held_out` of the time; a long one between is cut."""
     learnt, kept, left = [], [], (1 - held_out) * sum(each.duration_s for each in recordings)
     for each in recordings:
         length = each.duration_s
@@ -150,7 +153,8 @@ def _training(config: DictConfig, system: type[System], store: RecordingStore, f
     base.model = model | {"optimization": base.optimizer}
     base.init, base.paths = config.checkpoint, {**config.paths, "run": str(folder)}
     base.wearer = {"recordings": digest(sorted(each.sha256 for each in store.entries.values()))}
-    content: Any = OmegaConf.to_container(base.data.dataset.content, resolve=True)
+    data: Any = base.data
+    content: Any = OmegaConf.to_container(data.dataset.content, resolve=True)
     if "conditions" in content:
         # In the model's order; embeddings, which no recording needs to have, as it takes them
         windows, given = content["conditions"], model["conditions"]
@@ -159,25 +163,18 @@ def _training(config: DictConfig, system: type[System], store: RecordingStore, f
         }
         content["conditions"] = {name: windows[name] | settings for name, settings in sized.items()}
         base.surroundings = {}
-    base.data.dataset.content = content
+    data.dataset.content = content
     # The last step, too, is followed by a validation, which leaves a checkpoint.
-    loading, validations = base.data.loading, -(-config.steps // base.data.loading.steps_per_epoch)
+    loading, validations = data.loading, -(-config.steps // data.loading.steps_per_epoch)
     loading.steps_per_epoch = -(-config.steps // validations)
     base.trainer.max_steps = validations * loading.steps_per_epoch
-    here = {name: each for name, each in base.data.sources.items() if each and (Path(each.root) / MANIFEST).is_file()}
+    here = {name: each for name, each in data.sources.items() if each and (Path(each.root) / MANIFEST).is_file()}
     total = sum(each.weight for each in here.values())
     for each in here.values():
         each.weight *= (1 - config.share) / total
     wearer = {"root": str(store.root), "weight": config.share, "bodies": False}
-    base.data.sources, base.data.val_sources = here | {WEARER: wearer}, {WEARER: wearer}
+    data.sources, data.val_sources = here | {WEARER: wearer}, {WEARER: wearer}
     return base
-
-
-def _error(system: System, store: RecordingStore) -> tuple[float, str]:
-    """The main error on the held-out recordings, and its name."""
-    scores = aggregate(list(evaluate(system, store, store.names("val"), [0])))
-    metric = next(iter(scores))
-    return scores[metric].mean, metric
 
 
 def main(arguments: list[str]) -> None:

@@ -151,12 +151,7 @@ def load_network(path: str | Path, kind: type[Network], experiment: str, *, part
 
 
 def share_checkpoint(
-    source: str | Path,
-    target: str | Path,
-    dtype: str = "float32",
-    *,
-    start: str | Path | None = None,
-    share: float = 1.0,
+    source: str | Path, target: str | Path, dtype: str = "float32", start: str | Path | None = None, share: float = 1.0
 ) -> None:
     """Write a shareable file of a checkpoint: averaged weights, statistics, the model's config, names of the data, and
     what the training took.
