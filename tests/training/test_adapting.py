@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from wearcap.cli import adapt, evaluate, train
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import DETECTED
-from wearcap.recording import RecordingStore
+from wearcap.recording import HeadStream, Motion, RecordingStore
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
@@ -86,9 +87,9 @@ def test_the_last_part_is_held_out():
     recordings = [recording_of(swaying_motion(600), "a"), recording_of(swaying_motion(1200), "b")]
     learnt, held_out = adapt.parted(recordings, 0.4)
     assert [each.name for each in learnt] == ["a", "b"]
-    joined = torch.cat([learnt[1].motion.t_world_root, held_out[0].motion.t_world_root])
-    assert torch.equal(joined, recordings[1].motion.t_world_root)
-    assert held_out[0].head.timestamps[0] == held_out[0].motion.timestamps[0] == pytest.approx(8.0, abs=0.1)
+    first, last, whole = (cast(Motion, each.motion) for each in (learnt[1], held_out[0], recordings[1]))
+    assert torch.equal(torch.cat([first.t_world_root, last.t_world_root]), whole.t_world_root)
+    assert cast(HeadStream, held_out[0].head).timestamps[0] == last.timestamps[0] == pytest.approx(8.0, abs=0.1)
     learnt, held_out = adapt.parted([recording_of(swaying_motion(200, k), f"{k}") for k in range(4)], 0.25)
     assert (len(learnt), [each.name for each in held_out]) == (3, ["3"]), "short ones stay whole"
 
@@ -98,6 +99,7 @@ def test_a_suits_take_is_true_motion(tmp_path):
     path.write_text(mvnx(swaying_motion(90)))
     [found] = adapt.true_recordings(path, DETECTED)
     assert found.head is not None
+    assert found.motion is not None
     assert found.motion.skeleton.joint_names == xsens23().joint_names
     assert (found.head.t_world_device - found.motion.joint("head").t).norm(dim=-1).max() < 0.2
 
