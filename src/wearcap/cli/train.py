@@ -86,7 +86,7 @@ def _no_advertisement(record: logging.LogRecord) -> bool:
 def _name_embeddings(config: DictConfig) -> None:
     """Set name and dimension of the image embeddings to those in the data (`surroundings.windows.image.encoder=clip`)."""
     windows = config.get("surroundings", {}).get("windows", {}).get("image")
-    if windows and "conditions" in config.data.dataset.get("content", {}):
+    if windows and windows.get("size") is None and "conditions" in config.data.dataset.get("content", {}):
         stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]
         windows.encoder, config.surroundings.network.image.size = embeddings_of(windows.encoder, stores)
 

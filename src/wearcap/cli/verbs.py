@@ -16,6 +16,7 @@ from wearcap.files import resource
 
 VERBS = {
     "train": "train a model: experiment=motion_diffusion_head data=cmu",
+    "adapt": "fit a checkpoint to one wearer: checkpoint=hmd2 recordings=DIR",
     "evaluate": "score checkpoints on a data set: checkpoint=hmd2 dataset=DIR",
     "capture": "turn recordings into motion: recording=FILE, or a DATASET",
     "live": "capture while people move: system=hmd2 source=vmc://:39540",
@@ -31,7 +32,7 @@ VERBS = {
     "demo": "simulated data, training, evaluation, capture and export",
 }
 """Verbs in the order of the help, each a module, with their lines."""
-FIRST = {"evaluate": "checkpoint", "capture": "recording", "export": "checkpoint", "scene": "scene", "track": "source"}
+FIRST = {"adapt": "checkpoint", "evaluate": "checkpoint", "capture": "recording", "export": "checkpoint", "scene": "scene", "track": "source"}
 """The setting that a word without a key is, by verbs with a config."""
 COLUMNS = 80
 _HYDRA = {

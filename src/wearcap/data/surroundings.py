@@ -158,11 +158,13 @@ class PlaceCodes(ConditionWindows):
 class Embeddings(ConditionWindows):
     """Embeddings of the recordings' cameras by one encoder."""
 
-    def __init__(self, encoder: str):
-        self.encoder, self.size = encoder, 0
+    def __init__(self, encoder: str, size: int | None = None):
+        """`size`: number of features, of embeddings that no recording needs to have; None: as the recordings say."""
+        self.encoder, self.size, self._given = encoder, size or 0, size
 
     def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
-        _, self.size = embeddings_of(self.encoder, [*stores])
+        if self._given is None:
+            _, self.size = embeddings_of(self.encoder, [*stores])
 
     @property
     def key(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -1,5 +1,6 @@
-"""Resampling of motions, concatenation of consecutive pieces, and the beginning of a recording."""
+"""Resampling of motions, concatenation of consecutive pieces, and spans of a recording."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -77,32 +78,37 @@ def _probabilities(motion: Motion, change: Callable[[Tensor], Tensor]) -> dict[s
 
 
 def first_seconds(recording: Recording, seconds: float) -> Recording:
-    """The beginning of a recording: `seconds` of every stream, counted from the first pose of head or motion.
+    """The beginning of a recording: `seconds` of every stream (`between_seconds`)."""
+    return between_seconds(recording, -math.inf, seconds)
 
-    Points, and intervals of an evaluation, stay as they are; interactions that begin later are left out.
+
+def between_seconds(recording: Recording, start: float, stop: float) -> Recording:
+    """A span of every stream of a recording, in seconds from the first pose of head or motion, `stop` excluded.
+
+    Points, and intervals of an evaluation, stay as they are; interactions outside it are left out.
     """
     lead = recording.head or recording.suit or recording.motion
     if lead is None or not len(lead.timestamps):
         return recording
-    stop_s = lead.timestamps[0].item() + seconds
+    start_s, stop_s = (lead.timestamps[0].item() + each for each in (start, stop))
     parts = {each.name: getattr(recording, each.name) for each in fields(recording)}
-    cut = {name: _until(part, stop_s) for name, part in parts.items()}
+    cut = {name: _between(part, start_s, stop_s) for name, part in parts.items()}
     if recording.interactions is not None:
-        rows = [(start, min(stop, stop_s), *rest) for start, stop, *rest in recording.interactions.rows]
+        rows = [(max(begin, start_s), min(end, stop_s), *rest) for begin, end, *rest in recording.interactions.rows]
         cut["interactions"] = Interactions.of(row for row in rows if row[0] < row[1])
     return replace(recording, **cut)
 
 
-def _until(part: Any, stop_s: float) -> Any:
-    """The frames of a stream, or of several by name, before a time; whatever has no timestamps stays as it is."""
+def _between(part: Any, start_s: float, stop_s: float) -> Any:
+    """The frames of a stream, or of several by name, in a span; whatever has no timestamps stays as it is."""
     if isinstance(part, dict):
-        return {name: _until(each, stop_s) for name, each in part.items()}
+        return {name: _between(each, start_s, stop_s) for name, each in part.items()}
     times = getattr(part, "timestamps", None)
     if times is None or len(times) <= 3:  # three numbers may also be those of a mount
         return part
-    stop = int(torch.searchsorted(times, stop_s))
+    start, stop = (int(torch.searchsorted(times, each)) for each in (start_s, stop_s))
     if isinstance(part, Motion):
-        return part.sliced(0, stop)
+        return part.sliced(start, stop)
     values = {each.name: getattr(part, each.name) for each in fields(part)}
     along = {name: value for name, value in values.items() if isinstance(value, Tensor | tuple)}
-    return replace(part, **{name: value[:stop] for name, value in along.items() if len(value) == len(times)})
+    return replace(part, **{name: value[start:stop] for name, value in along.items() if len(value) == len(times)})
