@@ -13,6 +13,7 @@ from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
+from wearcap.io.formats.vrma import write_vrma
 from wearcap.recording.motion import Motion
 
 
@@ -27,28 +28,40 @@ def write_smplh(motion: Motion, path: Path) -> None:
     write_amass(on_skeleton(motion, smplh52()), path)
 
 
-def write_surface(motion: Motion, path: Path) -> None:
-    """A .glb with a human surface, or with bones alone for a skeleton that it does not fit."""
+def usd_writer() -> Callable[..., None]:
+    """`io.formats.usd.write_usd`. Raises WearcapError when the extra is missing."""
+    try:
+        from wearcap.io.formats.usd import write_usd
+    except ImportError as error:
+        raise WearcapError("USD files need the package usd-core", fix="Run: pip install 'wearcap[usd]'") from error
+    return write_usd
+
+
+def _write_with_surface(motion: Motion, path: Path) -> None:
+    """A .glb or USD with a human surface, or with bones alone for a skeleton that it does not fit."""
+    write = write_glb if path.suffix == ".glb" else usd_writer()
     try:
         body = anny_body(motion.skeleton)
     except WearcapError:
         body = None
-    write_glb(motion, path, body=body)
+    write(motion, path, body=body)
 
 
+USD = (".usd", ".usda", ".usdc", ".usdz")
 WRITERS: dict[str, Callable[[Motion, Path], None]] = {
     ".npz": write_motion,
     ".bvh": write_bvh,
-    ".glb": write_surface,
     "_smplh.npz": write_smplh,
+    ".vrma": write_vrma,
+    **dict.fromkeys((".glb", *USD), _write_with_surface),
 }
 """What writes a motion, by the ending of the file's name; the longest ending counts."""
 
 
 def save(motion: Motion, path: str | Path) -> None:
-    """Write a motion as .npz, .bvh, .glb or _smplh.npz.
+    """Write a motion as .npz, .bvh, .glb, .usd (.usda, .usdc, .usdz), .vrma or _smplh.npz.
 
-    Raises WearcapError for another ending, and when the file cannot be written.
+    Raises WearcapError for another ending, a missing extra, and when the file cannot be written.
     """
     endings = [ending for ending in WRITERS if Path(path).name.endswith(ending)]
     if not endings:
