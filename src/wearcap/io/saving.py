@@ -1,6 +1,6 @@
 """Motion as a file of the kind that its name's ending says."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.retarget import retarget
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import smplh52
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
@@ -56,6 +56,17 @@ WRITERS: dict[str, Callable[[Motion, Path], None]] = {
     **dict.fromkeys((".glb", *USD), _write_with_surface),
 }
 """What writes a motion, by the ending of the file's name; the longest ending counts."""
+
+
+def require_formats(endings: Sequence[str]) -> None:
+    """Raise WearcapError unless motion can be written with each of these endings ("glb"), and what that needs is there."""
+    if isinstance(endings, str):
+        raise WearcapError(f"formats={endings}", expected=f"a list: formats=[{endings}]")
+    known = [ending.removeprefix(".") for ending in WRITERS if ending.startswith(".")]
+    for ending in endings:
+        require_choice(ending, known, f"formats has {ending!r}")
+        if f".{ending}" in USD:
+            usd_writer()
 
 
 def save(motion: Motion, path: str | Path) -> None:
