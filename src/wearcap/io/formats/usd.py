@@ -4,6 +4,7 @@ In wearcap's axes (z up, metres). Time code 0 is the motion's first frame, a tim
 and frames that are not evenly spaced have codes between whole ones. Needs the extra `usd`.
 """
 
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -51,27 +52,28 @@ def write_usd(
     """
     require_drawable(motion, path)
     path = Path(path)
-    scan_name = f"{path.stem}_scan.usdc"
-    if path.suffix != ".usdz":
+    # USD replaces what it saves by a file of its own, so that it saves elsewhere, and its bytes are copied.
+    with tempfile.TemporaryDirectory() as folder:
+        layer = Path(folder, path.name).with_suffix(".usdc" if path.suffix == ".usdz" else path.suffix)
+        scan_file = Path(folder, f"{path.stem}_scan.usdc")
         if scan is not None:
-            with atomic_path(path.with_name(scan_name)) as temporary:
-                _write_scan(scan, temporary)
-        with atomic_path(path) as temporary:
-            _write_stage(motion, temporary, body, environment, None if scan is None else scan_name)
-        return
-    with tempfile.TemporaryDirectory() as folder, atomic_path(path) as temporary:
-        if scan is not None:
-            _write_scan(scan, Path(folder, scan_name))
-        layer = Path(folder, f"{path.stem}.usdc")
-        _write_stage(motion, layer, body, environment, None if scan is None else scan_name)
-        if not UsdUtils.CreateNewUsdzPackage(str(layer), str(temporary)):
-            raise WearcapError("cannot be packed", path, "a file that can be written")
+            _write_scan(scan, scan_file)
+        _write_stage(motion, layer, body, environment, None if scan is None else scan_file.name)
+        if path.suffix == ".usdz":
+            package = layer.with_suffix(".usdz")
+            if not UsdUtils.CreateNewUsdzPackage(str(layer), str(package)):
+                raise WearcapError("cannot be packed", path, "a file that can be written")
+            made = [package]
+        else:
+            made = [layer] if scan is None else [scan_file, layer]
+        for file in made:
+            with atomic_path(path.with_name(file.name)) as temporary:
+                shutil.copyfile(file, temporary)
 
 
 @contextmanager
 def _stage(path: Path, root: str) -> Iterator[tuple[Usd.Stage, Usd.Prim]]:
     """A new stage in wearcap's axes and its default prim; saved at the end."""
-    path.unlink(missing_ok=True)
     try:
         stage = Usd.Stage.CreateNew(str(path))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
