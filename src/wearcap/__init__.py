@@ -44,9 +44,10 @@ def source(path, height: float | None = None, scene=None, **stated):
 
 
 def save(motion, path) -> None:
-    """Write a `recording.Motion` as what the name's ending says: .npz, .bvh, .glb or _smplh.npz (SMPL+H, as AMASS has it).
+    """Write a `recording.Motion` as what the name's ending says: .npz, .bvh, .glb, .usd (.usda, .usdc, .usdz), .vrma (VRM
+    animation) or _smplh.npz (SMPL+H, as AMASS has it).
 
-    Raises WearcapError for another ending, and when the file cannot be written.
+    Raises WearcapError for another ending, a missing extra, and when the file cannot be written.
     """
     from wearcap.io.saving import save as save_motion
 

@@ -44,13 +44,14 @@ from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.io.formats.smpl import read_smpl
-from wearcap.io.saving import on_skeleton, write_smplh
+from wearcap.io.saving import USD, on_skeleton, require_formats, save, usd_writer, write_smplh
 from wearcap.metrics.gait import crouches
 from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, LearnedSystem, StageOptions, System
 from wearcap.runtime.walked_stature import with_walked_stature
+from wearcap.scene.objects import Environment
 from wearcap.tracking.stature import skeleton_of, with_stature
 
 
@@ -67,7 +68,7 @@ def run(config: DictConfig) -> Motion | None:
 
 
 def captured(config: Any, system: System) -> Motion | None:
-    """Capture one recording and write motion.npz, .bvh, .glb and .mp4 (beside the ground truth, if there is one).
+    """Capture one recording and write motion.npz, the `formats`, and motion.mp4 (beside the ground truth, if there is one).
 
     A pipeline with stages also writes report.json, and only that if `until` names a stage before the motion exists.
     """
@@ -75,6 +76,7 @@ def captured(config: Any, system: System) -> Motion | None:
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     filmed_s = _filmed_s(config.video)
+    require_formats(config.formats)
     source = _input(config, system)
     recording = source.recording
     seeds = range(config.seed, config.seed + config.samples)
@@ -91,12 +93,12 @@ def captured(config: Any, system: System) -> Motion | None:
         motion.provenance.update(recording=str(config.recording))
         if recording.origin is not None:
             motion.provenance.update(origin=" ".join(map(str, recording.origin.tolist())))
-        _write(motion, recording, folder, config)
+        environment = None if motion.object_motion is None else system.objects(source)
+        _write(motion, source, environment, folder, config)
         if (knee_deg := crouches(motion)) is not None:
             show(
                 f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"
             )
-        environment = None if motion.object_motion is None else system.objects(source)
         truth = with_objects(recording, environment)
         shown = {} if truth is None else {"truth": truth}
         if drawing is not None:  # sample-0.npz, …, and samples.png: the variety from one input (thesis Fig. 6.6)
@@ -137,9 +139,9 @@ def _input(config: Any, system: System) -> CaptureInput:
     return source
 
 
-def _write(motion: Motion, recording: Recording, folder: Path, config: Any) -> None:
+def _write(motion: Motion, source: CaptureInput, environment: Environment | None, folder: Path, config: Any) -> None:
+    recording = source.recording
     write_motion(motion, folder / "motion.npz")
-    write_bvh(motion, folder / "motion.bvh", origin=recording.origin if config.map_coordinates else None)
     shown, body = motion, anny_body(motion.skeleton, recording.shape or None) if config.body is True else None
     if isinstance(config.body, str):
         shown, body, betas, pelvis = _on_smpl(motion, recording, config.body)
@@ -147,7 +149,16 @@ def _write(motion: Motion, recording: Recording, folder: Path, config: Any) -> N
             write_amass(shown, folder / "motion_smplh.npz", betas, pelvis)
     elif config.smpl:
         write_smplh(motion, folder / "motion_smplh.npz")
-    write_glb(shown, folder / "motion.glb", body=body)
+    for ending in config.formats:
+        path = folder / f"motion.{ending}"
+        if path.suffix in USD:
+            usd_writer()(shown, path, body, environment, source.read_surface())
+        elif ending == "glb":
+            write_glb(shown, path, body=body)
+        elif ending == "bvh":
+            write_bvh(motion, path, origin=recording.origin if config.map_coordinates else None)
+        else:
+            save(motion, path)
 
 
 def _filmed_s(video: Any) -> float:

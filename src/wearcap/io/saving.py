@@ -1,6 +1,6 @@
 """Motion as a file of the kind that its name's ending says."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,11 +8,12 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.retarget import retarget
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import smplh52
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
+from wearcap.io.formats.vrma import write_vrma
 from wearcap.recording.motion import Motion
 
 
@@ -27,28 +28,51 @@ def write_smplh(motion: Motion, path: Path) -> None:
     write_amass(on_skeleton(motion, smplh52()), path)
 
 
-def write_surface(motion: Motion, path: Path) -> None:
-    """A .glb with a human surface, or with bones alone for a skeleton that it does not fit."""
+def usd_writer() -> Callable[..., None]:
+    """`io.formats.usd.write_usd`. Raises WearcapError when the extra is missing."""
+    try:
+        from wearcap.io.formats.usd import write_usd
+    except ImportError as error:
+        raise WearcapError("USD files need the package usd-core", fix="Run: pip install 'wearcap[usd]'") from error
+    return write_usd
+
+
+def _write_with_surface(motion: Motion, path: Path) -> None:
+    """A .glb or USD with a human surface, or with bones alone for a skeleton that it does not fit."""
+    write = write_glb if path.suffix == ".glb" else usd_writer()
     try:
         body = anny_body(motion.skeleton)
     except WearcapError:
         body = None
-    write_glb(motion, path, body=body)
+    write(motion, path, body=body)
 
 
+USD = (".usd", ".usda", ".usdc", ".usdz")
 WRITERS: dict[str, Callable[[Motion, Path], None]] = {
     ".npz": write_motion,
     ".bvh": write_bvh,
-    ".glb": write_surface,
     "_smplh.npz": write_smplh,
+    ".vrma": write_vrma,
+    **dict.fromkeys((".glb", *USD), _write_with_surface),
 }
 """What writes a motion, by the ending of the file's name; the longest ending counts."""
 
 
-def save(motion: Motion, path: str | Path) -> None:
-    """Write a motion as .npz, .bvh, .glb or _smplh.npz.
+def require_formats(endings: Sequence[str]) -> None:
+    """Raise WearcapError unless motion can be written with each of these endings ("glb"), and what that needs is there."""
+    if isinstance(endings, str):
+        raise WearcapError(f"formats={endings}", expected=f"a list: formats=[{endings}]")
+    known = [ending.removeprefix(".") for ending in WRITERS if ending.startswith(".")]
+    for ending in endings:
+        require_choice(ending, known, f"formats has {ending!r}")
+        if f".{ending}" in USD:
+            usd_writer()
 
-    Raises WearcapError for another ending, and when the file cannot be written.
+
+def save(motion: Motion, path: str | Path) -> None:
+    """Write a motion as .npz, .bvh, .glb, .usd (.usda, .usdc, .usdz), .vrma or _smplh.npz.
+
+    Raises WearcapError for another ending, a missing extra, and when the file cannot be written.
     """
     endings = [ending for ending in WRITERS if Path(path).name.endswith(ending)]
     if not endings:

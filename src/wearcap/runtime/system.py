@@ -16,8 +16,10 @@ from typing import Any, ClassVar
 from rich.console import Console
 
 from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.environment import FILE_NAME, read_environment
-from wearcap.io.formats.scene_folder import cloud_file, read_scan
+from wearcap.io.formats.ply import Ply
+from wearcap.io.formats.scene_folder import SURFACES, cloud_file, read_scan
 from wearcap.metrics.scores import score
 from wearcap.metrics.table import Row
 from wearcap.models.build import target_of
@@ -66,6 +68,18 @@ class CaptureInput:
             unit = None if self.metres_per_unit is None else float(self.metres_per_unit)
             return read_scan(self.scan, metres_per_unit=unit)
         return self.scan
+
+    def read_surface(self) -> Mesh | None:
+        """The scene (m) with its triangles where its file has them, else its points, without faces.
+
+        Raises WearcapError for a file that cannot be read.
+        """
+        if self.scan is None:
+            return None
+        if isinstance(self.scan, Path) and self.metres_per_unit is None and self.scan.suffix.lower() in SURFACES:
+            return SURFACES[self.scan.suffix.lower()](self.scan)
+        scan = self.read_scan()
+        return None if scan is None else Ply(scan.points, scan.colors).mesh
 
     def environment_file(self, given: str | Path | None = None) -> Path | None:
         """File of the objects: the given one (or in the given folder), else the one that the recording names."""

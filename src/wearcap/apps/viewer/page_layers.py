@@ -1,6 +1,6 @@
 """Layers of the page; each moves to a time by sending poses, without resending meshes. Objects and contacts for pictures, too."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -25,9 +25,7 @@ from wearcap.geometry.mesh import Mesh, capsules
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory, nearest_frames
-from wearcap.io.formats.glb import read_glb
-from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.wavefront import read_obj
+from wearcap.io.formats.scene_folder import SURFACES
 from wearcap.recording.active_objects import NO_OBJECT, active_at, true_spans
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, HeadStream, PointCloud, Recording
@@ -265,16 +263,9 @@ def add_cloud(
     scene.add_point_cloud(name, near, colors, point_size=size_m, precision="float32", position=centre, **look)
 
 
-_SCENES: dict[str, Callable[[Path], Mesh]] = {
-    ".ply": lambda path: read_ply(path).mesh,
-    ".obj": read_obj,
-    ".glb": read_glb,
-}
-
-
 def read_scene(path: Path) -> trimesh.Trimesh:
     """The recording's surroundings. Raises WearcapError when the file cannot be read, or has no triangles."""
-    read = _SCENES.get(path.suffix.lower())
+    read = SURFACES.get(path.suffix.lower())
     mesh = None if read is None else read(path)
     if mesh is None or not len(mesh.faces):
         what = "not a scene of a kind that is shown" if mesh is None else "a scene without triangles"

@@ -42,7 +42,7 @@ _GREY = np.full(3, 0.7, np.float32)
 
 
 @dataclass(frozen=True)
-class _SkinnedMesh:
+class SkinnedMesh:
     """A mesh in the rest pose (m, wearcap's axes, root at the origin), with up to four weighted joints per vertex."""
 
     mesh: Mesh
@@ -58,7 +58,7 @@ class _SkinnedMesh:
         return np.where(loose, np.float32([0, 0, 1]), normals).astype(np.float32)
 
     @classmethod
-    def of_body(cls, body: BodyModel, skeleton: Skeleton) -> "_SkinnedMesh":
+    def of_body(cls, body: BodyModel, skeleton: Skeleton) -> "SkinnedMesh":
         """A body model's skin. Raises WearcapError when the motion's skeleton has other joints than the body."""
         if body.skeleton.joint_names != skeleton.joint_names:
             what = f"the motion has skeleton {skeleton.name!r}, the body {body.skeleton.name!r}"
@@ -71,7 +71,7 @@ class _SkinnedMesh:
         return cls(mesh, joints, weights / weights.sum(-1, keepdims=True), body.skeleton.rest_joints)
 
     @classmethod
-    def sticks(cls, skeleton: Skeleton) -> "_SkinnedMesh":
+    def sticks(cls, skeleton: Skeleton) -> "SkinnedMesh":
         """A rounded stick along every bone and out to every site; each moves with the joint it starts from."""
         bones = [(parent, skeleton.t_parent_joint[joint]) for joint, parent in enumerate(skeleton.parents) if joint]
         bones += [(skeleton.index(site.joint), torch.tensor(site.t_joint_site)) for site in skeleton.sites.values()]
@@ -89,23 +89,30 @@ class _SkinnedMesh:
         return cls(mesh, joints, weights, skeleton.rest_joints)
 
 
+def require_drawable(motion: Motion, path: str | Path) -> None:
+    """Raise WearcapError for a motion that is empty, not finite or not rising in time, in itself or in its objects."""
+    tracks = (motion.object_motion or {}).values()
+    clocks = [motion.timestamps, *(track.timestamps for track in tracks if len(track))]
+    values = [motion.R_parent_joint, motion.t_world_root]
+    values += [v for track in tracks for v in (track.R_world_body, track.t_world_body)]
+    if len(motion) == 0 or not all(value.isfinite().all() for value in (*values, *clocks)):
+        raise WearcapError("the motion is empty or holds NaN or infinite values", path, "finite poses")
+    if not all((clock.diff() > 0).all() for clock in clocks):
+        raise WearcapError("timestamps repeat or fall", path, "rising timestamps")
+
+
 def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -> None:
     """Write a motion and its body as .glb; without a body, sticks stand for the bones. Objects become empty nodes.
 
     Animation time starts at 0. Raises WearcapError for a motion that is empty, not finite or not rising in time, and
     for a body with other joints.
     """
+    require_drawable(motion, path)
     tracks = motion.object_motion or {}
     clocks = [motion.timestamps, *(track.timestamps for track in tracks.values() if len(track))]
-    values = [motion.R_parent_joint, motion.t_world_root]
-    values += [v for track in tracks.values() for v in (track.R_world_body, track.t_world_body)]
-    if len(motion) == 0 or not all(value.isfinite().all() for value in (*values, *clocks)):
-        raise WearcapError("the motion is empty or holds NaN or infinite values", path, "finite poses")
-    if not all((clock.diff() > 0).all() for clock in clocks):
-        raise WearcapError("timestamps repeat or fall", path, "rising timestamps")
     joints = len(motion.skeleton)
-    shown = _SkinnedMesh.sticks(motion.skeleton) if body is None else _SkinnedMesh.of_body(body, motion.skeleton)
-    figure = _Figure(start_s=min(clock[0].item() for clock in clocks))
+    shown = SkinnedMesh.sticks(motion.skeleton) if body is None else SkinnedMesh.of_body(body, motion.skeleton)
+    figure = Figure(start_s=min(clock[0].item() for clock in clocks))
     figure.add_joints(motion)
     figure.animate(motion.timestamps, dict(enumerate(motion.R_parent_joint.unbind(1), 1)), {1: motion.t_world_root})
     for name, track in tracks.items():
@@ -141,7 +148,7 @@ def _certainty(motion: Motion) -> dict[str, Any]:
     return {"extras": {"joint_std_mm": by_joint, "joint_dof": motion.joint_dof}}
 
 
-def _quat_xyzw(R: Float[Tensor, "element 3 3"]) -> Float32[np.ndarray, "element 4"]:
+def quats_xyzw(R: Float[Tensor, "element 3 3"]) -> Float32[np.ndarray, "element 4"]:
     """Unit quaternions that never flip their sign from one element to the next."""
     xyzw = rotation.quat_wxyz_from_matrix(R.double()).roll(-1, dims=-1).numpy()
     flips = np.cumprod(np.where((xyzw[1:] * xyzw[:-1]).sum(-1) < 0, -1.0, 1.0))
@@ -149,7 +156,7 @@ def _quat_xyzw(R: Float[Tensor, "element 3 3"]) -> Float32[np.ndarray, "element 
     return xyzw.astype(np.float32)
 
 
-class _Figure:
+class Figure:
     """The growing document: nodes, animation, and the binary chunk with the accessors that describe it."""
 
     def __init__(self, start_s: float):
@@ -163,7 +170,7 @@ class _Figure:
 
     def add_joints(self, motion: Motion) -> None:
         """Node 0 turns the axes; joint k of the skeleton is node k + 1, posed as in the first frame."""
-        skeleton, quat_xyzw = motion.skeleton, _quat_xyzw(motion.R_parent_joint[0]).tolist()
+        skeleton, quat_xyzw = motion.skeleton, quats_xyzw(motion.R_parent_joint[0]).tolist()
         offsets = skeleton.t_parent_joint.tolist()
         offsets[0] = motion.t_world_root[0].tolist()
         self.nodes.append({"name": "z_up", "rotation": _Z_UP_XYZW, "children": [1]})
@@ -199,18 +206,18 @@ class _Figure:
         """Key frames of nodes' rotations and translations on one clock."""
         time = self.add((timestamps - self.start_s).float().numpy(), bounds=True)
         keys = [(node, "translation", value.float().numpy()) for node, value in t.items()]
-        keys += [(node, "rotation", _quat_xyzw(value)) for node, value in R.items()]
+        keys += [(node, "rotation", quats_xyzw(value)) for node, value in R.items()]
         for node, path, values in keys:
             self.channels.append({"sampler": len(self.samplers), "target": {"node": node, "path": path}})
             self.samplers.append({"input": time, "output": self.add(values), "interpolation": "LINEAR"})
 
-    def inverse_bind(self, skin: _SkinnedMesh) -> int:
+    def inverse_bind(self, skin: SkinnedMesh) -> int:
         """Accessor of the matrices that bring rest vertices into each joint's frame (column-major)."""
         matrices = np.tile(np.eye(4, dtype=np.float32), (len(skin.rest_joints), 1, 1))
         matrices[:, 3, :3] = -skin.rest_joints.float().numpy()
         return self.add(matrices)
 
-    def primitive(self, skin: _SkinnedMesh) -> dict[str, Any]:
+    def primitive(self, skin: SkinnedMesh) -> dict[str, Any]:
         attributes = {
             "POSITION": self.add(skin.mesh.vertices, _VERTICES, bounds=True),
             "NORMAL": self.add(skin.normals, _VERTICES),

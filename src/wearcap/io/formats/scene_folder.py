@@ -3,6 +3,7 @@
 Scans are PLY and PCD files, whose unit, extent and density are checked.
 """
 
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -11,13 +12,22 @@ import numpy as np
 from wearcap.boundary.opening import path_inside, understood
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.camera_json import PHOTOS_FILE, read_photos
 from wearcap.io.formats.colmap import Tracks, read_colmap
+from wearcap.io.formats.glb import read_glb
 from wearcap.io.formats.navvis import is_navvis_scan, read_navvis_scan
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.wavefront import read_obj
 from wearcap.scene.scan import Photo, Scan
 
+SURFACES: dict[str, Callable[[Path], Mesh]] = {
+    ".ply": lambda path: read_ply(path).mesh,
+    ".obj": read_obj,
+    ".glb": read_glb,
+}
+"""What reads a scene's surface as it is shown, by the ending of the file's name; a cloud has no faces."""
 MAX_EXTENT_M = 5000.0
 """Largest extent (m) of a scene that a person walks through in one recording."""
 MAX_HEIGHT_M = 500.0
