@@ -44,7 +44,7 @@ def source(path, height: float | None = None, scene=None, **stated):
 
 
 def save(motion, path) -> None:
-    """Write a `recording.Motion` as what the name's ending says: .npz, .bvh, .glb or _smplh.npz (SMPL+H, as AMASS has it).
+    """Write a `recording.Motion` as what the name's ending says: .npz, .bvh, .glb, _smplh.npz (SMPL+H, as AMASS has it), .trc and .mot (OpenSim) or _angles.csv (joint angles, ISB).
 
     Raises WearcapError for another ending, and when the file cannot be written.
     """

@@ -4,7 +4,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from wearcap.body.anny_body import anny_body
+from wearcap.body.kinematics import site_positions
 from wearcap.body.retarget import retarget
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import smplh52
@@ -12,7 +15,9 @@ from wearcap.errors import WearcapError
 from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
+from wearcap.io.formats.mot import write_angles, write_mot
 from wearcap.io.formats.motion_npz import write_motion
+from wearcap.io.formats.trc import Markers, write_trc
 from wearcap.recording.motion import Motion
 
 
@@ -36,17 +41,28 @@ def write_surface(motion: Motion, path: Path) -> None:
     write_glb(motion, path, body=body)
 
 
+def write_virtual_markers(motion: Motion, path: Path) -> None:
+    """A .trc with a marker at each joint's centre and each landmark (heels, toe tips, crown …), by their names."""
+    skeleton, T = motion.skeleton, motion.T_world_joint
+    sites = tuple(skeleton.sites)
+    points = torch.cat([T.t, site_positions(skeleton, T, sites)], 1) if sites else T.t
+    write_trc(Markers(motion.timestamps, (*skeleton.joint_names, *sites), points.double()), path)
+
+
 WRITERS: dict[str, Callable[[Motion, Path], None]] = {
     ".npz": write_motion,
     ".bvh": write_bvh,
     ".glb": write_surface,
     "_smplh.npz": write_smplh,
+    ".trc": write_virtual_markers,
+    ".mot": write_mot,
+    "_angles.csv": write_angles,
 }
 """What writes a motion, by the ending of the file's name; the longest ending counts."""
 
 
 def save(motion: Motion, path: str | Path) -> None:
-    """Write a motion as .npz, .bvh, .glb or _smplh.npz.
+    """Write a motion as .npz, .bvh, .glb, _smplh.npz, .trc, .mot or _angles.csv.
 
     Raises WearcapError for another ending, and when the file cannot be written.
     """
