@@ -38,6 +38,7 @@ from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.saving import on_skeleton, write_smplh
 from wearcap.metrics.gait import crouches
+from wearcap.metrics.strides import gait_report
 from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, dataset_folder
@@ -87,6 +88,9 @@ def captured(config: Any, system: System) -> Motion | None:
             show(
                 f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"
             )
+        if (gait := gait_report(motion)) is not None:
+            write_text(folder / "gait.json", json.dumps(gait, indent=1) + "\n")
+            show(f"gait: {gait['strides']} strides, gait.json")
         environment = None if motion.object_motion is None else system.objects(source)
         truth = with_objects(recording, environment)
         shown = {} if truth is None else {"truth": truth}
