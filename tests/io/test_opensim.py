@@ -115,7 +115,9 @@ def test_signs_are_the_model_s(tmp_path):
         R[:, base.skeleton.index(joint)] = about_axis(axis, torch.tensor(angle))
     wearcap.save(replace(base, R_parent_joint=R), tmp_path / "a.mot")
     _, at = parsed_mot(tmp_path / "a.mot")
-    degrees = {name: round(float(np.rad2deg(angle)), 3) for name, angle in (("hip", 0.5), ("knee", 0.4), ("ankle", 0.2))}
+    degrees = {
+        name: round(float(np.rad2deg(angle)), 3) for name, angle in (("hip", 0.5), ("knee", 0.4), ("ankle", 0.2))
+    }
     assert at["hip_flexion_r"][0] == pytest.approx(degrees["hip"], abs=1e-3)
     assert at["knee_angle_l"][0] == pytest.approx(degrees["knee"], abs=1e-3)
     assert at["ankle_angle_l"][0] == pytest.approx(degrees["ankle"], abs=1e-3)

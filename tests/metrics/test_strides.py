@@ -56,7 +56,9 @@ def test_a_limp_is_an_asymmetry(walked):
     report = gait_report(replace(walked, timestamps=walked.timestamps + late))
     assert report is not None
     assert report["asymmetry_percent"]["step_time_s"] == pytest.approx(200 * -0.2 / CYCLE, abs=2)
-    assert report["asymmetry_percent"]["step_length_m"] == pytest.approx(gait_report(walked)["asymmetry_percent"]["step_length_m"])
+    assert report["asymmetry_percent"]["step_length_m"] == pytest.approx(
+        gait_report(walked)["asymmetry_percent"]["step_length_m"]
+    )
     assert report["right"]["stance_percent"]["std"] < 1
 
 

@@ -103,7 +103,9 @@ def test_three_angles_at_once_as_scipy_takes_them_apart():
 
 @pytest.mark.parametrize("sequence", ["ZXY", "YXZ", "YXY"])
 def test_angles_rebuild_the_rotation_also_in_gimbal_lock(sequence):
-    middles = np.array([-90, -89.99, -40, 0, 0.1, 40, 89.99, 90] if sequence != "YXY" else [0, 0.2, 1, 90, 179, 179.9, 180])
+    middles = np.array(
+        [-90, -89.99, -40, 0, 0.1, 40, 89.99, 90] if sequence != "YXY" else [0, 0.2, 1, 90, 179, 179.9, 180]
+    )
     grid = np.stack(np.meshgrid([-170, -30, 0, 50, 120], middles, [-100, 0, 20, 179]), -1).reshape(-1, 3)
     grid[:, 1] *= -1 if sequence == "YXY" else 1
     R = Rotation.from_euler(sequence, grid, degrees=True)

@@ -154,7 +154,9 @@ def _load_markers(path: Path, how: Conventions) -> Loaded:
         motion, distance = fit_motion(body, markers)
     fitted, check = f"{len(body.names)} markers, {1000 * rms_m(distance):.0f} mm (rms) from the body", Check("markers")
     notes = fit_notes(body, markers, distance)
-    recording = Recording(path.name.split(".")[0], motion=motion, skeleton=motion.skeleton, note="; ".join([fitted, *notes]))
+    recording = Recording(
+        path.name.split(".")[0], motion=motion, skeleton=motion.skeleton, note="; ".join([fitted, *notes])
+    )
     return Loaded(recording, [check.ok("a body was fitted", fitted), *(check.note(note) for note in notes)])
 
 

@@ -18,7 +18,16 @@ from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, DETECTED, UNITS_M, Conventions
 from wearcap.io.formats.trc import Markers, markers_of, read_trc
 
-_DAMAGE = (AssertionError, struct.error, ArithmeticError, LookupError, TypeError, ValueError, AttributeError, MemoryError)
+_DAMAGE = (
+    AssertionError,
+    struct.error,
+    ArithmeticError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    MemoryError,
+)
 _BLOCK = 512
 
 

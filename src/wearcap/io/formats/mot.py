@@ -67,5 +67,7 @@ def write_angles(motion: Motion, path: str | Path) -> None:
 
 def _write(motion: Motion, columns: dict[str, np.ndarray], path: str | Path, comma: str, head: list[str]) -> None:
     rows = np.stack(list(columns.values()), 1)
-    cells = (comma.join([exact(time), *(f"{x:.6f}" for x in row)]) for time, row in zip(motion.timestamps.tolist(), rows))
+    cells = (
+        comma.join([exact(time), *(f"{x:.6f}" for x in row)]) for time, row in zip(motion.timestamps.tolist(), rows)
+    )
     write_text(path, "\n".join([*head, *cells]) + "\n")

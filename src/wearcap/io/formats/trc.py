@@ -45,7 +45,9 @@ def markers_of(
     Raises WearcapError naming the file for names that repeat, times that do not rise, and a unit or axis that is not known.
     """
     if not (len(times) and 0 < len(set(names)) == len(names) <= _MOST):
-        raise WearcapError(f"{len(names)} names of markers in {len(times)} frames", path, f"1 to {_MOST}, all different")
+        raise WearcapError(
+            f"{len(names)} names of markers in {len(times)} frames", path, f"1 to {_MOST}, all different"
+        )
     if unit_m is None or up not in R_WORLD_FILE:
         raise WearcapError("no unit, or an axis up of another sign", path, f"up=x, y or z, unit={'|'.join(UNITS_M)}")
     check_rising(times, path)
