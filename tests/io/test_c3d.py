@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import wearcap
-from command_line import exit_code
 from c3d_files import trial, write_c3d
+from command_line import exit_code
 from marker_person import markers_of, person, squats
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import Conventions

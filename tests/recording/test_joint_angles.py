@@ -1,13 +1,21 @@
 """Joint angles: one joint turned by a known angle in a known plane shows that angle and no other, as SciPy finds it, too."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from wearcap.body.skeleton import xsens23
+from data_prep.cmu import cmu_tasks
+from data_prep.shared.engine import Splits
+from data_prep.shared.mocap import MOCAP
+from wearcap.body.skeleton import SIDES, xsens23
 from wearcap.body.skeletons import smplh52
+from wearcap.cli.conf import compose, splits_dir
 from wearcap.geometry.rotation import about_axis
+from wearcap.metrics.gait import cycle_times
+from wearcap.metrics.strides import gait_report
 from wearcap.recording import Motion
 from wearcap.recording.joint_angles import CENTRAL, SIDED, euler_deg, joint_angles
 
@@ -139,3 +147,47 @@ def test_all_angles_come_for_every_frame_and_in_motion():
     angles = joint_angles(Motion(times, skeleton, R, torch.zeros(9, 3)))
     assert len(angles) == 3 * (len(CENTRAL) + 2 * len(SIDED))
     assert angles["left_knee_flexion"].numpy() == pytest.approx(np.rad2deg(0.1 * times.numpy()), abs=1e-3)
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_people_walk_within_the_normal_ranges(real_data):
+    """A trial of CMU's validation people at 1.5 m/s. Extremes of the mean cycle, and of stride parameters, of healthy adults
+    with some margin (Perry & Burnfield 2010; Winter 1991); hips are lower by the pelvis' neutral tilt."""
+    config = compose("prepare", ["prepare=cmu"])
+    splits = Splits.read(splits_dir() / "cmu.csv")
+    tasks = cmu_tasks(
+        real_data / "cmu_mocap", splits, MOCAP, config.amc_fps, "CMU", config.repair, list(config.usual_m)
+    )
+    task = next(task for task in tasks if task.name == "39_01")
+    assert task.split == "val"
+    recording = task.make()
+    motion, contacts = recording.motion, recording.contacts
+    assert motion is not None
+    assert contacts is not None
+    angles, times = joint_angles(motion), motion.timestamps.numpy()
+    ranges = {
+        "hip_flexion": ((-35, -8), (18, 40)), "knee_flexion": ((-3, 14), (52, 78)), "ankle_dorsiflexion": ((-35, -8), (5, 28)),
+        "hip_adduction": ((-15, -1), (1, 15)), "ankle_inversion": ((-20, 3), (-6, 15)),
+    }  # fmt: skip
+    for name, bounds in ranges.items():
+        cycles = [
+            np.interp(points, times, angles[f"{side}_{name}"].numpy())
+            for side, of_side in zip(SIDES, cycle_times(motion))
+            for points in of_side.numpy()
+        ]
+        assert len(cycles) >= 2
+        mean = np.mean(cycles, 0)
+        for extreme, (low, high) in zip((mean.min(), mean.max()), bounds):
+            assert low <= extreme <= high, (name, extreme)
+        if name == "knee_flexion":
+            assert mean.argmax() < 8 or mean.argmax() > 92, "cycles begin at the peak of swing"
+        if name == "hip_flexion":
+            assert 60 < mean.argmin() < 95, "extended before the swing"
+    report = gait_report(replace(motion, contact_prob=contacts.contact.float()))
+    assert report is not None
+    for side in SIDES:
+        assert 55 < report[side]["stance_percent"]["mean"] < 68
+        assert 95 < report[side]["cadence_per_min"]["mean"] < 135
+        assert 1.2 < report[side]["speed_m_s"]["mean"] < 1.8
+        assert 0 < report[side]["step_width_m"]["mean"] < 0.25

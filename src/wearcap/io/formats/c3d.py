@@ -77,7 +77,7 @@ def _points(reader: Any, size: int) -> np.ndarray:
     there = size - _BLOCK * (int(reader.header.data_block) - 1)
     if used < 1 or frames < 1 or needed > there:
         raise ValueError(f"{frames} frames of {used} points would take {needed} bytes, of which there are {there}")
-    points = np.empty((frames, used, 3))
+    points = np.full((frames, used, 3), np.nan)
     for row, (_, values, _) in zip(points, reader.read_frames(copy=False)):
         row[:] = np.where(values[:, 3:4] < 0, np.nan, values[:, :3])
     return points

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from wearcap.body.landmarks import landmarks
+from wearcap.body.skeleton import SIDES
 from wearcap.files import write_text
 from wearcap.io.formats.trc import R_WORLD_FILE, exact
 from wearcap.recording.joint_angles import euler_deg, joint_angles, relative_rotations
@@ -45,7 +47,8 @@ def opensim_coordinates(motion: Motion) -> dict[str, np.ndarray]:
         if name == "knee":
             found[names[0]] = -found[names[0]]
         if joint == "pelvis":
-            hips = (motion.joint("left_hip").t + motion.joint("right_hip").t).double() / 2
+            legs = [landmarks(motion.skeleton).limb[f"{each}_leg"][0] for each in SIDES]
+            hips = motion.T_world_joint.t[:, legs].double().mean(1)
             forward = R.numpy() @ np.array(_PELVIS_M) * motion.skeleton.stature / _MODEL_STATURE_M
             place = hips.numpy() @ R_WORLD_FILE["y"] + forward
             found |= {f"pelvis_t{axis}": place[:, k] for k, axis in enumerate("xyz")}
