@@ -1,5 +1,6 @@
 """What gait laboratories report of walking: steps and strides, their lengths, times and symmetry, from a motion's contacts."""
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from statistics import fmean, stdev
@@ -58,8 +59,9 @@ def strides(motion: Motion) -> tuple[list[Stride], list[Stride]]:
     stances = _stances(motion)
     found: tuple[list[Stride], list[Stride]] = ([], [])
     for k, sign in ((0, 1.0), (1, -1.0)):
+        others = [stance.start_s for stance in stances[1 - k]]
         for here, there in pairwise(stances[k]):
-            between = [stance for stance in stances[1 - k] if here.start_s < stance.start_s < there.start_s]
+            between = stances[1 - k][bisect_right(others, here.start_s) : bisect_left(others, there.start_s)]
             duration, gone = there.start_s - here.start_s, there.place - here.place
             length = float(np.linalg.norm(gone))
             if len(between) != 1 or not _STRIDE_S[0] < duration < _STRIDE_S[1] or length < _STRIDE_M:
@@ -72,16 +74,16 @@ def strides(motion: Motion) -> tuple[list[Stride], list[Stride]]:
             x, y = other.place - here.place
             found[k].append(
                 Stride(
-                    length,
-                    float((there.place - other.place) @ along),
-                    sign * float(x * along[1] - y * along[0]),
-                    duration,
-                    there.start_s - other.start_s,
-                    stance,
-                    duration - stance,
-                    100 * stance / duration,
-                    120 / duration,
-                    length / duration,
+                    stride_length_m=length,
+                    step_length_m=float((there.place - other.place) @ along),
+                    step_width_m=sign * float(x * along[1] - y * along[0]),
+                    stride_time_s=duration,
+                    step_time_s=there.start_s - other.start_s,
+                    stance_time_s=stance,
+                    swing_time_s=duration - stance,
+                    stance_percent=100 * stance / duration,
+                    cadence_per_min=120 / duration,
+                    speed_m_s=length / duration,
                 )
             )
     return found

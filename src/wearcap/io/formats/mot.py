@@ -11,6 +11,7 @@ import numpy as np
 from wearcap.body.landmarks import landmarks
 from wearcap.body.skeleton import SIDES
 from wearcap.files import write_text
+from wearcap.io.formats.poses import check_finite
 from wearcap.io.formats.trc import R_WORLD_FILE, exact
 from wearcap.recording.joint_angles import euler_deg, joint_angles, relative_rotations
 from wearcap.recording.motion import Motion
@@ -56,20 +57,21 @@ def opensim_coordinates(motion: Motion) -> dict[str, np.ndarray]:
 
 
 def write_mot(motion: Motion, path: str | Path) -> None:
-    """Write OpenSim's coordinates of a motion atomically. Raises WearcapError as `opensim_coordinates` does."""
+    """Write OpenSim's coordinates of a motion atomically. Raises WearcapError as `opensim_coordinates` does, and for NaN."""
     columns = opensim_coordinates(motion)
     head = [Path(path).stem, "version=1", f"nRows={len(motion)}", f"nColumns={1 + len(columns)}", "inDegrees=yes"]
     _write(motion, columns, path, "\t", [*head, "endheader", "\t".join(["time", *columns])])
 
 
 def write_angles(motion: Motion, path: str | Path) -> None:
-    """Write `joint_angles` as CSV, columns `time_s` and `…_deg`. Raises WearcapError where limbs are not recognised."""
+    """Write `joint_angles` as CSV, columns `time_s` and `…_deg`. Raises WearcapError where limbs are not recognised, and for NaN."""
     columns = {f"{name}_deg": angle.numpy() for name, angle in joint_angles(motion).items()}
     _write(motion, columns, path, ",", [",".join(["time_s", *columns])])
 
 
 def _write(motion: Motion, columns: dict[str, np.ndarray], path: str | Path, comma: str, head: list[str]) -> None:
     rows = np.stack(list(columns.values()), 1)
+    check_finite({"an angle": rows}, path)
     cells = (
         comma.join([exact(time), *(f"{x:.6f}" for x in row)]) for time, row in zip(motion.timestamps.tolist(), rows)
     )
