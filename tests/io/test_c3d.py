@@ -14,6 +14,7 @@ from marker_person import markers_of, person, squats
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import Conventions
 from wearcap.io.formats.c3d import read_c3d, read_markers
+from wearcap.io.formats.trc import Markers
 from wearcap.metrics.gait import knee_deg
 
 pytest.importorskip("c3d", reason='needs the extra: pip install "wearcap[biomechanics]"')
@@ -53,6 +54,14 @@ def test_a_person_goes_through_every_door(tmp_path, capsys):
     assert "2 analog channels" in recording.note
     assert exit_code(["doctor", str(path)]) == 0
     assert "2 analog channels" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
+def test_markers_that_no_body_fits_are_refused(tmp_path):
+    names = markers_of(squats(person(), 0.1)).names
+    unseen = torch.full((5, len(names), 3), torch.nan, dtype=torch.float64)
+    path = write_c3d(Markers(torch.arange(5).double() / 100, names, unseen), tmp_path / "a.c3d")
+    with pytest.raises(WearcapError, match="no body fits these markers"):
+        wearcap.read(path)
 
 
 def _patched(content: bytes, at: int, value: int) -> bytes:

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from wearcap.boundary.arrays import read_npz
-from wearcap.boundary.opening import placed
+from wearcap.boundary.opening import placed, understood
 from wearcap.checks.consistency import check_files
 from wearcap.checks.examine import require_sound
 from wearcap.checks.places import is_map, is_place, read_environment_file, read_map, read_place
@@ -149,7 +149,8 @@ def _load_foreign(path: Path, how: Conventions) -> Loaded:
 def _load_markers(path: Path, how: Conventions) -> Loaded:
     """Optical markers as the motion of a body that is fitted to this trial alone."""
     markers = read_markers(path, how)
-    with placed(path):
+    # Markers that are never seen at a time, or kilometres apart, leave equations without a solution.
+    with placed(path), understood("no body fits these markers", path, "a person", "Check the unit.", RuntimeError):
         body = fit_body([markers])
         motion, distance = fit_motion(body, markers)
     fitted, check = f"{len(body.names)} markers, {1000 * rms_m(distance):.0f} mm (rms) from the body", Check("markers")
