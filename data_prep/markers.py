@@ -1,4 +1,4 @@
-"""Optical markers in TRC files, named as in Vicon's Plug-in Gait: a body per person, then its motion."""
+"""Optical markers in TRC and C3D files, named as in Vicon's Plug-in Gait: a body per person, then its motion."""
 
 import re
 from collections.abc import Callable
@@ -13,11 +13,12 @@ from wearcap.boundary.opening import placed, understood
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO, Conventions
-from wearcap.io.formats.trc import Markers, read_trc
-from wearcap.optimize.markers import MARKERS, MarkerBody, fit_body, fit_motion, plug_in_gait
+from wearcap.io.formats.c3d import read_markers
+from wearcap.io.formats.trc import Markers
+from wearcap.optimize.markers import MarkerBody, fit_body, fit_motion, fit_notes, rms_m
 from wearcap.recording.recording import Recording
 
-VERSION = 1
+VERSION = 2
 """Version of the fit, increased when the same source and settings yield another recording."""
 
 
@@ -27,28 +28,24 @@ BODY_TRIALS = 24
 """Number of a person's trials from which bones and places of markers are estimated."""
 
 
-LARGEST_RMS_M = 0.015
-"""Root mean square of the markers' distances from the body above which a trial gets a note."""
-
-
 def markers_tasks(
-    source: str | Path,  # the folder with the .trc files (searched as deep as it goes)
+    source: str | Path,  # the folder with the files (searched as deep as it goes)
     splits: Splits,
     settings: MocapSettings = MOCAP,
     license: str = "unknown",  # kept in every recording: say whose data it is
-    files: str = "*.trc*",  # their names
+    files: str = "*.trc*,*.c3d*",  # their names
     subject: str | None = None,  # null: the folder; or a pattern with one group, a name
     activity: str | None = None,  # null: none; or a pattern with one group, a name
-    unit: str | float | int = AUTO,  # of length: what the file says; or m, cm, mm, inch …, or metres per unit
-    up: str = AUTO,  # the axis that is up: x, y, z; auto is y
+    unit: str | float | int = AUTO,  # of length: what the file states; or m, cm, mm, inch …, or metres per unit
+    up: str = AUTO,  # the axis that is up: x, y, z; auto: what a C3D file states, of TRC y
 ) -> list[Task]:
-    """One task per file below `source` whose name matches the pattern `files`, named by its path; a body per subject.
+    """One task per file below `source` whose name matches one of the patterns `files`, named by its path; a body per subject.
 
     `subject` and `activity` are each a regular expression with one group, searched in the path below `source`, or one name
     for all. By default the subject is the folder, and there is no activity.
     """
     how = Conventions(unit=unit, up=up)
-    return marker_tasks("markers", source, splits, settings, license, files, (subject, activity), {}, how, read_trc)
+    return marker_tasks("markers", source, splits, settings, license, files, (subject, activity), {}, how, read_markers)
 
 
 def marker_tasks(
@@ -67,7 +64,7 @@ def marker_tasks(
     may replace what the latter finds."""
     source = source_folder(source)
     abouts, persons = dict[Path, About](), dict[str, list[Path]]()
-    for path in sorted(source.rglob(files)):
+    for path in sorted({path for pattern in files.split(",") for path in source.rglob(pattern)}):
         below = path.relative_to(source)
         name = "__".join([*below.parent.parts, path.name.split(".")[0]]).replace(" ", "_")
         folder = below.parent.as_posix() if below.parent.parts else source.resolve().name
@@ -117,14 +114,10 @@ def _recording(
     with placed(path):
         body = _body(files, how, read)
         motion, distance = fit_motion(body, markers)
-    rms, each = distance.square().nanmean().sqrt().item(), distance.square().nanmean(0).nan_to_num(0.0)
-    unknown = [name for name in markers.names if plug_in_gait(name) not in MARKERS]
-    notes = [f"markers left out, whose place is not known: {', '.join(unknown[:20])}"] if unknown else []
-    if rms > LARGEST_RMS_M:
-        notes.append(
-            f"markers are {100 * rms:.1f} cm (rms) from the body, most of all {body.names[int(each.argmax())]}"
-        )
-    recording = mocap_recording(replace(motion, provenance={"markers_rms_m": f"{rms:.4f}"}), about, settings)
+    notes = fit_notes(body, markers, distance)
+    recording = mocap_recording(
+        replace(motion, provenance={"markers_rms_m": f"{rms_m(distance):.4f}"}), about, settings
+    )
     assert recording.motion is not None
     known = recording.motion.provenance
     note = "; ".join([*notes, *([known[NOTE]] if NOTE in known else [])])

@@ -67,7 +67,7 @@ def write_trc(markers: Markers, path: Path, prefix: str = "Anna:") -> None:
     head = ["PathFileType\t4\t(X/Y/Z)\tmarkers.trc", "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate"]
     names = "Frame#\tTime\t" + "\t\t\t".join(prefix + name for name in markers.names)
     rows = [*head, rates, names, "\t\t" + "\t".join(f"X{k + 1}\tY{k + 1}\tZ{k + 1}" for k in range(count)), ""]
-    for k, places in enumerate((1000 * markers.t_world_marker[..., [1, 2, 0]]).tolist()):
+    for k, places in enumerate((1000 * markers.t_world_marker[..., [0, 2, 1]] * torch.tensor([1, 1, -1])).tolist()):
         cells = ["\t\t" if math.isnan(x) else f"{x:.3f}\t{y:.3f}\t{z:.3f}" for x, y, z in places]
         rows.append("\t".join([str(k + 1), f"{markers.timestamps[k]:.4f}", *cells]))
     path.parent.mkdir(parents=True, exist_ok=True)

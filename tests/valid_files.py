@@ -8,6 +8,7 @@ import sys
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ import test_watch_log  # noqa: E402
 import totalcapture_files  # noqa: E402
 from PIL import Image  # noqa: E402
 
+import c3d_files  # noqa: E402
 import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
 import marker_person  # noqa: E402
@@ -52,6 +54,7 @@ from wearcap.io.formats import (  # noqa: E402
     asf_amc,
     bsor,
     bvh,
+    c3d,
     camera_frames,
     camera_json,
     colmap,
@@ -287,6 +290,10 @@ def _video(path: Path) -> None:
     video.write_frames(path, [np.full((32, 48, 3), 20 * k, np.uint8) for k in range(6)], 30.0)
 
 
+def _c3d(path: Path) -> None:
+    c3d_files.write_c3d(_markers(), path, analog=2)
+
+
 def _markers() -> trc.Markers:
     places = torch.rand(5, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return trc.Markers(torch.arange(5, dtype=torch.float64) / 100, ("LASI", "RASI", "C7"), places)
@@ -472,6 +479,7 @@ READERS: dict[str, Reader] = {
     ),
     "x_imu": Reader(_x_imu, lambda folder: watch_log.read_inertial_log(folder / "Inertial.csv", "left_wrist")),
     "watch_calibration": one("c.json", WORN, watch_calibration.read_watch_calibration),
+    **({"c3d": made("m.c3d", _c3d, c3d.read_c3d)} if find_spec("c3d") else {}),
     "trc": made("m.trc", lambda path: marker_person.write_trc(_markers(), path), trc.read_trc),
     "tum": one("t.txt", TUM, trajectory.read_trajectory),
     "tum_gz": one("t.txt.gz", gzip.compress(TUM.encode(), mtime=0), trajectory.read_trajectory),

@@ -45,7 +45,7 @@ def source(path, height: float | None = None, scene=None, **stated):
 
 def save(motion, path) -> None:
     """Write a `recording.Motion` as what the name's ending says: .npz, .bvh, .glb, .usd (.usda, .usdc, .usdz), .vrma (VRM
-    animation) or _smplh.npz (SMPL+H, as AMASS has it).
+    animation), _smplh.npz (SMPL+H, as AMASS has it), .trc and .mot (OpenSim) or _angles.csv (joint angles, ISB).
 
     Raises WearcapError for another ending, a missing extra, and when the file cannot be written.
     """

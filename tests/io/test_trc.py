@@ -24,7 +24,7 @@ def trc(path: Path, rates: str = "2\tcm", rows: str = ROWS) -> Path:
 
 @pytest.mark.parametrize(
     ("up", "first"),
-    [("auto", [0.03, 0.01, 0.02]), ("y", [0.03, 0.01, 0.02]), ("z", [0.01, 0.02, 0.03]), ("x", [0.02, 0.03, 0.01])],
+    [("auto", [0.01, -0.03, 0.02]), ("y", [0.01, -0.03, 0.02]), ("z", [0.01, 0.02, 0.03]), ("x", [0.02, 0.03, 0.01])],
 )
 def test_units_axes_and_empty_fields(tmp_path, up, first):
     markers = read_trc(trc(tmp_path / "a.trc"), Conventions(up=up))

@@ -86,7 +86,7 @@ def test_data_sets_register_their_kinds():
 
 def test_other_files_get_one_line(tmp_path):
     (tmp_path / "marks.c3d").write_bytes(b"x")
-    with pytest.raises(WearcapError, match="Markers have no skeleton"):
+    with pytest.raises(WearcapError, match="C3D file"):
         read(tmp_path / "marks.c3d")
     (tmp_path / "a.docx").write_bytes(b"x")
     with pytest.raises(WearcapError, match="not a kind of file that holds a recording"):
@@ -128,7 +128,7 @@ def test_a_pipeline_says_what_the_file_lacks(take):
 
 def test_motions_are_saved_by_their_names(tmp_path):
     motion = swaying_motion(10)
-    for name in ("a.npz", "a.bvh", "a.glb", "a_smplh.npz"):
+    for name in ("a.npz", "a.bvh", "a.glb", "a_smplh.npz", "a.trc", "a.mot", "a_angles.csv"):
         wearcap.save(motion, tmp_path / name)
         assert (tmp_path / name).stat().st_size > 500
     assert read_motion(tmp_path / "a.npz").skeleton == motion.skeleton

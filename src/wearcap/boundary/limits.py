@@ -53,6 +53,7 @@ LIMITS = {
     "mesh": Limits(bytes=1 << 31, items=1 << 21),  # lists of a .glb, its vertices and corners
     "environment": Limits(bytes=1 << 24, items=10_000),  # objects
     "lens": Limits(bytes=1 << 24),
+    "c3d": Limits(bytes=1 << 30),  # an hour of 100 markers at 300 Hz, or of force plates at 10 kHz
     "bvh": Limits(items=2000),  # joints
     "asf": Limits(items=2000),  # bones
     "colmap": Limits(bytes=1 << 34),

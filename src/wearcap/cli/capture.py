@@ -44,8 +44,9 @@ from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.io.formats.smpl import read_smpl
-from wearcap.io.saving import USD, on_skeleton, require_formats, save, usd_writer, write_smplh
+from wearcap.io.saving import FORMATS, USD, on_skeleton, require_formats, save, usd_writer, write_smplh
 from wearcap.metrics.gait import crouches
+from wearcap.metrics.strides import gait_report
 from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, dataset_folder
@@ -99,6 +100,9 @@ def captured(config: Any, system: System) -> Motion | None:
             show(
                 f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"
             )
+        if (gait := gait_report(motion)) is not None:
+            write_text(folder / "gait.json", json.dumps(gait, indent=1) + "\n")
+            show(f"gait: {gait['strides']} strides, gait.json")
         truth = with_objects(recording, environment)
         shown = {} if truth is None else {"truth": truth}
         if drawing is not None:  # sample-0.npz, …, and samples.png: the variety from one input (thesis Fig. 6.6)
@@ -149,13 +153,13 @@ def _write(motion: Motion, source: CaptureInput, environment: Environment | None
             write_amass(shown, folder / "motion_smplh.npz", betas, pelvis)
     elif config.smpl:
         write_smplh(motion, folder / "motion_smplh.npz")
-    for ending in config.formats:
-        path = folder / f"motion.{ending}"
+    for name in config.formats:
+        path = folder / f"motion{FORMATS[name]}"
         if path.suffix in USD:
             usd_writer()(shown, path, body, environment, source.read_surface())
-        elif ending == "glb":
+        elif name == "glb":
             write_glb(shown, path, body=body)
-        elif ending == "bvh":
+        elif name == "bvh":
             write_bvh(motion, path, origin=recording.origin if config.map_coordinates else None)
         else:
             save(motion, path)

@@ -32,7 +32,14 @@ VERBS = {
     "demo": "simulated data, training, evaluation, capture and export",
 }
 """Verbs in the order of the help, each a module, with their lines."""
-FIRST = {"adapt": "checkpoint", "evaluate": "checkpoint", "capture": "recording", "export": "checkpoint", "scene": "scene", "track": "source"}
+FIRST = {
+    "adapt": "checkpoint",
+    "evaluate": "checkpoint",
+    "capture": "recording",
+    "export": "checkpoint",
+    "scene": "scene",
+    "track": "source",
+}
 """The setting that a word without a key is, by verbs with a config."""
 COLUMNS = 80
 _HYDRA = {

@@ -4,7 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from wearcap.body.anny_body import anny_body
+from wearcap.body.kinematics import site_positions
 from wearcap.body.retarget import retarget
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import smplh52
@@ -12,7 +15,9 @@ from wearcap.errors import WearcapError, require_choice
 from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
+from wearcap.io.formats.mot import write_angles, write_mot
 from wearcap.io.formats.motion_npz import write_motion
+from wearcap.io.formats.trc import Markers, write_trc
 from wearcap.io.formats.vrma import write_vrma
 from wearcap.recording.motion import Motion
 
@@ -47,6 +52,14 @@ def _write_with_surface(motion: Motion, path: Path) -> None:
     write(motion, path, body=body)
 
 
+def write_virtual_markers(motion: Motion, path: Path) -> None:
+    """A .trc with a marker at each joint's centre and each landmark (heels, toe tips, crown …), by their names."""
+    skeleton, T = motion.skeleton, motion.T_world_joint
+    sites = tuple(skeleton.sites)
+    points = torch.cat([T.t, site_positions(skeleton, T, sites)], 1) if sites else T.t
+    write_trc(Markers(motion.timestamps, (*skeleton.joint_names, *sites), points.double()), path)
+
+
 USD = (".usd", ".usda", ".usdc", ".usdz")
 WRITERS: dict[str, Callable[[Motion, Path], None]] = {
     ".npz": write_motion,
@@ -54,23 +67,27 @@ WRITERS: dict[str, Callable[[Motion, Path], None]] = {
     "_smplh.npz": write_smplh,
     ".vrma": write_vrma,
     **dict.fromkeys((".glb", *USD), _write_with_surface),
+    ".trc": write_virtual_markers,
+    ".mot": write_mot,
+    "_angles.csv": write_angles,
 }
 """What writes a motion, by the ending of the file's name; the longest ending counts."""
+FORMATS = {ending.strip("._").split(".")[0]: ending for ending in WRITERS}
+"""Endings by the words of `formats` ("glb", "angles")."""
 
 
-def require_formats(endings: Sequence[str]) -> None:
-    """Raise WearcapError unless motion can be written with each of these endings ("glb"), and what that needs is there."""
-    if isinstance(endings, str):
-        raise WearcapError(f"formats={endings}", expected=f"a list: formats=[{endings}]")
-    known = [ending.removeprefix(".") for ending in WRITERS if ending.startswith(".")]
-    for ending in endings:
-        require_choice(ending, known, f"formats has {ending!r}")
-        if f".{ending}" in USD:
+def require_formats(names: Sequence[str]) -> None:
+    """Raise WearcapError unless motion can be written in each of these `FORMATS`, and what that needs is there."""
+    if isinstance(names, str):
+        raise WearcapError(f"formats={names}", expected=f"a list: formats=[{names}]")
+    for name in names:
+        require_choice(name, FORMATS, f"formats has {name!r}")
+        if FORMATS[name] in USD:
             usd_writer()
 
 
 def save(motion: Motion, path: str | Path) -> None:
-    """Write a motion as .npz, .bvh, .glb, .usd (.usda, .usdc, .usdz), .vrma or _smplh.npz.
+    """Write a motion as .npz, .bvh, .glb, .usd (.usda, .usdc, .usdz), .vrma, _smplh.npz, .trc, .mot or _angles.csv.
 
     Raises WearcapError for another ending, a missing extra, and when the file cannot be written.
     """

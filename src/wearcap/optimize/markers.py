@@ -86,6 +86,8 @@ _STRAIGHT_DEG, _STRAIGHT_STD_DEG = 5.0, 3.0
 """Flexion (degrees) below which a hinge resists, and the standard deviation below it."""
 EVIDENCE = 20.0
 """Number of independent frames that a person's frames are worth: skin errs alike in many of them."""
+LARGEST_RMS_M = 0.015
+"""Root mean square of the markers' distances from the body above which a trial gets a note."""
 _FRAMES, _FADE = 192, 5
 _SOFT_M, _ANEW_M = 0.04, 0.02
 _NOD = math.radians(7.0)
@@ -167,6 +169,23 @@ def fit_motion(body: MarkerBody, trial: Markers) -> tuple[Motion, Float[Tensor, 
     R[again], t[again] = _solve_poses(body, seen[again], R[start], t[start])
     distance = (body.places(R, t)[2] - seen.y).norm(dim=-1).where(seen.weight > 0, torch.nan)
     return Motion(trial.timestamps, body.skeleton, R.float(), t.float()), distance.float()
+
+
+def rms_m(distance: Float[Tensor, "time marker"]) -> float:
+    """Root mean square (m) of the distances of markers that were seen."""
+    return distance.square().nanmean().sqrt().item()
+
+
+def fit_notes(body: MarkerBody, trial: Markers, distance: Float[Tensor, "time marker"]) -> list[str]:
+    """What is to be known of a fitted trial: what the file holds beside known markers, and markers far from the body."""
+    unknown = [name for name in trial.names if plug_in_gait(name) not in MARKERS]
+    notes = [f"left out: {trial.left_out}"] if trial.left_out else []
+    if unknown:
+        notes.append(f"markers left out, whose place is not known: {', '.join(unknown[:20])}")
+    if (rms := rms_m(distance)) > LARGEST_RMS_M:
+        worst = body.names[int(distance.square().nanmean(0).nan_to_num(0.0).argmax())]
+        notes.append(f"markers are {100 * rms:.1f} cm (rms) from the body, most of all {worst}")
+    return notes
 
 
 def _nominal_body(names: tuple[str, ...], trials: Sequence[Markers]) -> MarkerBody:

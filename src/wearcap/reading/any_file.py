@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from wearcap.boundary.arrays import read_npz
+from wearcap.boundary.opening import placed, understood
 from wearcap.checks.consistency import check_files
 from wearcap.checks.examine import require_sound
 from wearcap.checks.places import is_map, is_place, read_environment_file, read_map, read_place
@@ -20,10 +21,12 @@ from wearcap.io.conventions import CHOICES, DETECTED, Conventions
 from wearcap.io.devices.aria_mps import is_mps_folder
 from wearcap.io.devices.headset_log import is_headset_session
 from wearcap.io.formats.amass import read_amass
+from wearcap.io.formats.c3d import read_markers
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.trajectory import trajectory_file, trajectory_format
+from wearcap.optimize.markers import fit_body, fit_motion, fit_notes, rms_m
 from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.prepare.suits import read_suit
 from wearcap.reading.kinds import Kind, Loaded, known
@@ -45,7 +48,7 @@ from wearcap.recording.store import MANIFEST, RecordingFile, load_recording
 def read(where: str | Path, how: Conventions = DETECTED, check: bool = False) -> Recording:
     """Read a recording from whatever holds one.
 
-    That is a prepared recording (DATASET/NAME or its .safetensors), MVNX, BVH, AMC with its ASF, AMASS or SMPL .npz, our
+    That is a prepared recording (DATASET/NAME or its .safetensors), MVNX, BVH, AMC with its ASF, markers (C3D, TRC), AMASS or SMPL .npz, our
     motion .npz, a trajectory, a watch's or a headset's log, or a folder of Aria MPS, Nymeria, Aria Digital Twin or
     TotalCapture, or of one session's logs. A suit without foot contacts gets those of its feet's speed. Names are those of
     the files. Raises WearcapError for what cannot be read, and with `check` for what the doctor calls an error.
@@ -92,7 +95,6 @@ def possible_kinds(path: Path) -> list[Kind]:
     if possible := [kind for kind in kinds() if kind.may_be(path)]:
         return possible
     fix = {
-        ".c3d": "Markers have no skeleton yet: solve them, and give the BVH.",
         ".fbx": "Export it as BVH (Blender, MotionBuilder and Maya do), and give that.",
         ".vrs": "It holds raw sensors: request Project Aria's MPS for it, and give the folder that MPS returns; with the extra "
         "wearcap[aria] the camera's pictures are taken from a data.vrs beside it.",
@@ -144,6 +146,21 @@ def _load_foreign(path: Path, how: Conventions) -> Loaded:
     return Loaded(recording, [Check("file").ok("a body was found", " ".join(found.report.lines()))])
 
 
+def _load_markers(path: Path, how: Conventions) -> Loaded:
+    """Optical markers as the motion of a body that is fitted to this trial alone."""
+    markers = read_markers(path, how)
+    # Markers that are never seen at a time, or kilometres apart, leave equations without a solution.
+    with placed(path), understood("no body fits these markers", path, "a person", "Check the unit.", RuntimeError):
+        body = fit_body([markers])
+        motion, distance = fit_motion(body, markers)
+    fitted, check = f"{len(body.names)} markers, {1000 * rms_m(distance):.0f} mm (rms) from the body", Check("markers")
+    notes = fit_notes(body, markers, distance)
+    recording = Recording(
+        path.name.split(".")[0], motion=motion, skeleton=motion.skeleton, note="; ".join([fitted, *notes])
+    )
+    return Loaded(recording, [check.ok("a body was fitted", fitted), *(check.note(note) for note in notes)])
+
+
 def _read_motion_folder(folder: Path) -> Recording:
     """What `wearcap live record=DIR` left of a wearer, also where it was killed."""
     motion = read_sections(motion_files(folder))
@@ -158,6 +175,7 @@ def _read_points(path: Path) -> Recording:
 MOTIONS = (
     Kind("AMC", _load_foreign, (".amc",), stated=("unit", "up")),
     Kind("BVH", _load_foreign, (".bvh",), stated=("unit", "up")),
+    Kind("markers", _load_markers, (".c3d", ".trc"), stated=("unit", "up")),
     Kind("MVNX", read_suit, (".mvnx",)),
     Kind(
         "trajectory",

@@ -39,8 +39,12 @@ def contacts_from_motion(motion: Motion) -> Bool[Tensor, "time patch"]:
     below = torch.where(speed < _SPEED[0], frame, 0).cummax(0).values
     above = torch.where(speed > _SPEED[1], frame, 0).cummax(0).values
     low = patches[..., 2] - patches[..., 2].amin(1, keepdim=True) < _MAX_HEIGHT_M
-    # Short gaps are closed, then short contacts dropped.
-    window = np.ones((max(int(np.ceil(_SHORTEST_S * motion.fps)), 1), 1), bool)
-    padded = np.pad(((below > above) & low).numpy(), ((len(window), len(window)), (0, 0)), mode="edge")
+    return steady((below > above) & low, motion.fps)
+
+
+def steady(contact: Bool[Tensor, "time patch"], fps: float) -> Bool[Tensor, "time patch"]:
+    """Contacts with short gaps closed, then short contacts dropped."""
+    window = np.ones((max(int(np.ceil(_SHORTEST_S * fps)), 1), 1), bool)
+    padded = np.pad(contact.numpy(), ((len(window), len(window)), (0, 0)), mode="edge")
     padded = scipy.ndimage.binary_opening(scipy.ndimage.binary_closing(padded, window), window)
     return torch.from_numpy(padded[len(window) : -len(window)])
