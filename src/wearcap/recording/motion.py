@@ -57,7 +57,7 @@ class Interactions:
         return (within[..., None] & self.hands).any(1)
 
 
-ESTIMATES = ("contact_prob", "hand_contact_prob", "body_contact_prob", "joint_std")
+ESTIMATES = ("contact_prob", "hand_contact_prob", "body_contact_prob", "joint_std", "fingers_measured")
 """Optional fields of a Motion with a row per frame."""
 PER_FRAME = ("timestamps", "R_parent_joint", "t_world_root", *ESTIMATES)
 
@@ -84,6 +84,8 @@ class Motion:
     """Pipeline, checkpoint and config hash, or the source of a ground truth."""
     joint_std: Float[Tensor, "time joint"] | None = None
     """Standard deviation (m) along each axis of every joint's position, as the system expects it."""
+    fingers_measured: Float[Tensor, "time hand"] | None = None
+    """1 where the fingers of each of `HANDS` follow a tracked hand; 0 where they are bridged, or at rest. None without fingers."""
 
     def __len__(self) -> int:
         return len(self.timestamps)

@@ -13,7 +13,8 @@ import numpy as np
 from wearcap.boundary.opening import open_bytes
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, DETECTED, Conventions
-from wearcap.io.devices.headset_axes import PALM_M, HeadsetLog, in_our_axes
+from wearcap.io.devices.headset_axes import CONVENTIONS, PALM_M, HeadsetLog, in_our_axes
+from wearcap.io.devices.headset_fingers import RawFingers, finger_stream
 from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, raw_poses
 from wearcap.io.devices.headset_tables import (
     DeviceRows,
@@ -42,19 +43,21 @@ def read_headset_log(path: str | Path, how: Conventions = DETECTED, time_unit: s
     Trials of a session are one recording, with gaps between them. Raises WearcapError for a file without a headset's
     poses and times, numbers that are none, and where nothing in the log determines a convention.
     """
-    poses, convention, notes = read_raw_poses(Path(path), time_unit, how.axes)
+    poses, fingers, convention, notes = read_raw_poses(Path(path), time_unit, how.axes)
     log = in_our_axes(poses, how, str(path), convention)
     for angles, allowed in _AXES_OF_ANGLES.items():
         if angles in notes and log.axes not in allowed:
             fix = "Say which axes the log has (axes=unity|unreal|openxr), or log quaternions."
             raise WearcapError(f"{angles}, but axes {log.axes}", path, f"axes {', '.join(allowed)}", fix)
-    return replace(log, notes=(*notes, *log.notes))
+    M = CONVENTIONS[log.axes].double().numpy()
+    hands = {side: finger_stream(raw, M, log.unit_m) for side, raw in fingers.items()}
+    return replace(log, fingers=hands, notes=(*notes, *log.notes))
 
 
 def read_raw_poses(
     path: Path, time_unit: str | None = None, axes: str = AUTO
-) -> tuple[dict[str, RawPoses], str | None, list[str]]:
-    """Poses of a log as they stand there, the axes that its format fixes, and notes. Raises as `read_headset_log` does."""
+) -> tuple[dict[str, RawPoses], dict[str, RawFingers], str | None, list[str]]:
+    """Poses and hands' joints of a log as they stand there, the axes that its format fixes, and notes. Raises as `read_headset_log` does."""
     if time_unit not in (None, *UNITS):
         raise WearcapError(f"time_unit={time_unit!r}", expected=f"one of {', '.join(UNITS)}")
     convention, notes = None, []
@@ -71,9 +74,9 @@ def read_raw_poses(
     else:
         rows = read_rows(path)
         convention = next((axes for words, axes in _AXES_OF_NAMES if words <= rows["head"].columns.words), None)
-    poses, mended = raw_poses(rows, time_unit, axes, path)
+    poses, fingers, mended = raw_poses(rows, time_unit, axes, path)
     usual = next((allowed[0] for angles, allowed in _AXES_OF_ANGLES.items() if angles in mended), None)
-    return poses, convention or usual, mended + notes
+    return poses, fingers, convention or usual, mended + notes
 
 
 def is_headset_log(path: str | Path) -> bool:
