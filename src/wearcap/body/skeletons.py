@@ -40,6 +40,10 @@ FINGERS = {
 """SMPL+H's order of fingers: first knuckle from the wrist, length of each of the two bones that follow (m)."""
 
 
+FINGER_JOINTS = tuple(f"{side}_{finger}{k}" for side in ("left", "right") for finger in FINGERS for k in (1, 2, 3))
+"""SMPL+H's finger joints, in its order."""
+
+
 def _hand(side: str) -> list[tuple[str, str, tuple[float, float, float]]]:
     y = 1.0 if side == "left" else -1.0
     rows = []

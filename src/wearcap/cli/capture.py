@@ -43,6 +43,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, LearnedSystem, StageOptions, System
 from wearcap.runtime.walked_stature import with_walked_stature
+from wearcap.tracking.fingers import with_fingers
 from wearcap.tracking.stature import skeleton_of, with_stature
 
 
@@ -82,7 +83,8 @@ def captured(config: Any, system: System) -> Motion | None:
         motion.provenance.update(recording=str(config.recording))
         if recording.origin is not None:
             motion.provenance.update(origin=" ".join(map(str, recording.origin.tolist())))
-        _write(motion, recording, folder, config)
+        whole = with_fingers(motion, recording.fingers)  # of every system's motion, as far as the recording has hands
+        _write(whole, recording, folder, config)
         if (knee_deg := crouches(motion)) is not None:
             show(
                 f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"
@@ -94,12 +96,13 @@ def captured(config: Any, system: System) -> Motion | None:
             motions = [each.motion for each in captures if each.motion is not None]
             draws = {f"sample {number}": draw for number, draw in enumerate(motions)}
             for label, draw in draws.items():
-                write_motion(draw, folder / f"{label.replace(' ', '-')}.npz")
+                write_motion(with_fingers(draw, recording.fingers), folder / f"{label.replace(' ', '-')}.npz")
             body = anny_body(motion.skeleton, recording.shape or None)
             save_png(folder / "samples.png", contact_sheet(shown | draws, body=body, environment=environment))
         if filmed_s:
-            body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
-            shown |= {"capture": motion}
+            drawn = whole if truth is None else motion  # one surface fits both
+            body = anny_body(drawn.skeleton, recording.shape or None) if config.body else None
+            shown |= {"capture": drawn}
             write_video(folder / "motion.mp4", shown, body=body, environment=environment, max_seconds=filmed_s)
     return motion
 
