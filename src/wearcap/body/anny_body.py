@@ -256,11 +256,12 @@ class _Fit:
                 torch.from_numpy(self.person[f"{side[0]}-finger-{n}-1"]).double() for n in (2, 3, 5)
             )
             given[arms[2]] = _axes(middle - wrist, index - pinky) @ _axes(out, eye[0]).T
-            ends_p = self.phalanges_of_person(side)
-            for name, (start, end) in self.phalanges(side, self.target_t_pose.t.numpy()).items():
-                along, wanted = (torch.from_numpy(b - a).double() for a, b in ((start, end), ends_p[name]))
-                joint = self.skeleton.index(name)
-                given[joint] = swing_between(given[arms[2]] @ along, wanted) @ given[arms[2]]
+            for name, (start, end, start_p, end_p) in self.phalanges(side, self.target_t_pose.t.numpy()).items():
+                along, wanted = (
+                    given[arms[2]] @ torch.from_numpy(end - start),
+                    torch.from_numpy(end_p - start_p).double(),
+                )
+                given[self.skeleton.index(name)] = swing_between(along, wanted) @ given[arms[2]]
         turns: list[Tensor] = []  # world rotations of the joints from the T-pose
         for joint, parent in enumerate(self.skeleton.parents):
             trunk = joint in (marks.root, marks.head, *marks.spine, *marks.neck) or joint in marks.collar.values()
@@ -268,24 +269,21 @@ class _Fit:
         R = torch.stack(turns) @ self.target_t_pose.R
         return forward_kinematics(self.skeleton, local_rotations(self.skeleton, R), torch.zeros(3, dtype=R.dtype))
 
-    def phalanges_of_person(self, side: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Start and end of each bone of the person's fingers by SMPL+H's joint."""
-        at = {name: [self.person[f"{side[0]}-{bone[:6]}-{bone[6]}-{k}"] for k in range(1, 5)] for bone, name in _FINGERS.items()}
-        return {f"{side}_{name}{k + 1}": (ends[k], ends[k + 1]) for name, ends in at.items() for k in range(3)}
+    def phalanges(self, side: str, t: Float[np.ndarray, "joint 3"]) -> dict[str, tuple[np.ndarray, ...]]:
+        """Start and end of each bone of the skeleton's fingers by its joint, for joints at `t`, and those of the person's.
 
-    def phalanges(self, side: str, t: Float[np.ndarray, "joint 3"]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """The same of the skeleton, whose joints are at `t`; nothing of one without fingers. A last bone, which has no joint at its
-        end, goes on as the one before in the T-pose, as long as its tip is away."""
-        ends: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        for name in _FINGERS.values():
-            joints = [f"{side}_{name}{k}" for k in (1, 2, 3)]
-            tip = self.skeleton.sites.get(f"{side}_{name}_tip")
-            if not set(joints) <= set(self.skeleton.joint_names):
-                continue
-            first, second, third = (t[self.skeleton.index(joint)] for joint in joints)
-            length = np.linalg.norm(tip.t_joint_site) if tip else 0.8 * _length((second, third))
-            ends |= {joints[0]: (first, second), joints[1]: (second, third)}
-            ends[joints[2]] = third, third + length * (third - second) / _length((second, third))
+        There are none of a skeleton without fingers. A last bone, with no joint at its end, goes on as the one before.
+        """
+        ends: dict[str, tuple[np.ndarray, ...]] = {}
+        for bone, finger in _FINGERS.items():
+            joints = [f"{side}_{finger}{k}" for k in (1, 2, 3)]
+            if set(joints) <= set(self.skeleton.joint_names):
+                ours, tip = [t[self.skeleton.index(joint)] for joint in joints], f"{side}_{finger}_tip"
+                length, before = _length(ours[1:]), ours[2] - ours[1]
+                site = self.skeleton.sites.get(tip)
+                ours.append(ours[2] + before / length * (np.linalg.norm(site.t_joint_site) if site else 0.8 * length))
+                theirs = [self.person[f"{side[0]}-finger-{bone[6]}-{k}"] for k in range(1, 5)]
+                ends |= {name: (*ours[k : k + 2], *theirs[k : k + 2]) for k, name in enumerate(joints)}
         return ends
 
     def foot_yaw(self, side: str) -> Float[np.ndarray, "3 3"]:
@@ -316,7 +314,7 @@ def _fit_to(fit: _Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3
         foot = _foot(fit, assets, surface, side, ankle)
         shoulder_p, elbow_p, wrist_p = fit.limb(side, "arm")
         shoulder, elbow, wrist = (t[joint] for joint in marks.limb[f"{side}_arm"])
-        tip = fit.skeleton.sites.get(f"{side}_fingertip")  # absent of hands with fingers
+        tip = fit.skeleton.sites.get(f"{side}_fingertip")
         reach_p = np.linalg.norm(fit.person[f"{side[0]}-finger-3-4"] - wrist_p)
         reach = np.linalg.norm(tip.t_joint_site) if tip else fit.girth * reach_p
         hand = np.clip(reach / reach_p, 0.85 * fit.girth, 1.15 * fit.girth)
@@ -328,8 +326,8 @@ def _fit_to(fit: _Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3
             f"{side}_lowerarm": _stretched(surface, (elbow_p, wrist_p), (elbow, wrist), fit.girth),
             f"{side}_hand": wrist + hand * (surface - wrist_p),
         }
-        ends, ends_p = fit.phalanges(side, t), fit.phalanges_of_person(side)
-        parts |= {name: _stretched(surface, ends_p[name], bone, hand) for name, bone in ends.items()}
+        for name, ends in fit.phalanges(side, t).items():
+            parts[name] = _stretched(surface, ends[2:], ends[:2], hand)
     group = [_phalanx(bone) if _phalanx(bone) in parts else _group(bone) for bone in assets.bones]
     total = np.zeros_like(surface)
     for name, moved in parts.items():

@@ -33,7 +33,9 @@ OPENXR = ("palm", *HAND_JOINTS)
 MEDIAPIPE = tuple(name for name in HAND_JOINTS if not name.endswith("_metacarpal") or name.startswith("thumb"))
 """The order of MediaPipe's 21 landmarks."""
 CHAINS = tuple(
-    tuple(HAND_JOINTS.index(f"{name}_{bone}") for bone in (_BONES[1:] if name != "thumb" else (*_BONES[:2], *_BONES[3:])))
+    tuple(
+        HAND_JOINTS.index(f"{name}_{bone}") for bone in (_BONES[1:] if name != "thumb" else (*_BONES[:2], *_BONES[3:]))
+    )
     for name in FINGER_NAMES
 )
 """Of each finger in `HAND_JOINTS`: start of its first bone, of the next two, and tip."""

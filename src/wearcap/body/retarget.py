@@ -24,16 +24,9 @@ def _arc_lengths(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
 
 
 def _carry(
-    turn: Float[Tensor, "*batch joint 3 3"],
-    source: TPose,
-    target: TPose,
-    parents: tuple[int, ...],
-    fingers: dict[int, int],
+    turn: Float[Tensor, "*batch joint 3 3"], source: TPose, target: TPose, parents: tuple[int, ...]
 ) -> Float[Tensor, "*batch joint_t 3 3"]:
-    """Turns of the target's joints, transferred from the source; joints without a counterpart follow their parent.
-
-    `fingers`: joints of fingers, the target's with the source's.
-    """
+    """Turns of the target's joints, transferred from the source; joints without a counterpart follow their parent."""
     from_s, to = source.marks, target.marks
     given: dict[int, Tensor] = {to.root: turn[..., from_s.root, :, :], to.head: turn[..., from_s.head, :, :]}
 
@@ -67,7 +60,6 @@ def _carry(
         for pair_s, pair_t in ((from_s.collar, to.collar), (from_s.toe, to.toe)):
             if pair_s[side] is not None and pair_t[side] is not None:
                 given[pair_t[side]] = turn[..., pair_s[side], :, :]
-    given |= {t: turn[..., s, :, :] for t, s in fingers.items()}
     turns: list[Tensor] = []
     for joint, parent in enumerate(parents):
         turns.append(given[joint] if joint in given else turns[parent])
@@ -90,9 +82,10 @@ def retarget(
     pose_s, pose_t = t_pose(source), t_pose(target)
     T_world_source = forward_kinematics(source, R_parent_joint, t_world_root)
     turn = T_world_source.R @ pose_s.R.to(T_world_source.R).transpose(-1, -2)
+    turns = _carry(turn, pose_s, pose_t, target.parents)
     shared = [name for name in FINGER_JOINTS if name in source and name in target]
-    fingers = dict(zip(target.indices(*shared), source.indices(*shared)))
-    R_world = _carry(turn, pose_s, pose_t, target.parents, fingers) @ pose_t.R.to(turn)
+    turns[..., target.indices(*shared), :, :] = turn[..., source.indices(*shared), :, :]
+    R_world = turns @ pose_t.R.to(turn)
     hips = [pose_s.marks.limb[f"{side}_leg"][0] for side in SIDES]
     centre = T_world_source.t[..., hips, :].mean(-2)
     t_root = centre - (R_world[..., 0, :, :] @ pose_t.hip_centre.to(centre)[:, None])[..., 0]

@@ -43,6 +43,16 @@ class WristSample(NamedTuple):
     T_world_joint: Rigid
 
 
+class HandSample(NamedTuple):
+    """Joints of a tracked hand at one time, as `recording.FingerStream` has them; all NaN while it is lost."""
+
+    side: str
+    timestamp: float
+    points: Float[Tensor, "joint 3"]
+    confidence: float = 1.0
+    rotations: Float[Tensor, "joint 3 3"] | None = None
+
+
 class ActiveObject(NamedTuple):
     """From this time on an object is the active one; None: no object is."""
 

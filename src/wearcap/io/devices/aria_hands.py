@@ -62,27 +62,22 @@ def read_fingers(files: Sequence[Path]) -> dict[str, FingerStream]:
 
     Raises WearcapError for missing columns, times that do not rise, and tracked rows with NaN.
     """
-    for path in files:
-        names = {side: [f"t{axis}_{side}_landmark_{k}_device" for k in range(21) for axis in "xyz"] for side in SIDES}
-        if not set(names["left"]) <= set(read_header(path)):
-            continue
-        scores = {side: f"{side}_tracking_confidence" for side in SIDES}
-        table = read_columns(path, [_TIME, *scores.values(), *names["left"], *names["right"]])
-        check_finite({name: table[name] for name in (_TIME, *scores.values())}, path)
-        check_rising(table[_TIME] * 1e-6, path)
-        hands = {}
-        for side in SIDES:
-            tracked = table[scores[side]] >= MIN_CONFIDENCE
-            if tracked.any():
-                points = np.stack([table[name] for name in names[side]], 1)
-                check_finite({f"{side} landmarks": points[tracked]}, path)
-                placed = in_layout(torch.from_numpy(points).float().unflatten(1, (-1, 3)), LANDMARKS)
-                sure = torch.from_numpy(table[scores[side]].clip(0, 1)).float()
-                hands[side] = FingerStream(
-                    torch.from_numpy(table[_TIME] * 1e-6), placed, torch.from_numpy(tracked), sure
-                )
-        return hands
-    return {}
+    names = {side: [f"t{axis}_{side}_landmark_{k}_device" for k in range(21) for axis in "xyz"] for side in SIDES}
+    path = next((path for path in files if set(names["left"]) <= set(read_header(path))), None)
+    if path is None:
+        return {}
+    scores = {side: f"{side}_tracking_confidence" for side in SIDES}
+    table = read_columns(path, [_TIME, *scores.values(), *names["left"], *names["right"]])
+    check_finite({name: table[name] for name in (_TIME, *scores.values())}, path)
+    check_rising(table[_TIME] * 1e-6, path)
+    hands, times = {}, torch.from_numpy(table[_TIME] * 1e-6)
+    for side in SIDES:
+        tracked, points = table[scores[side]] >= MIN_CONFIDENCE, np.stack([table[name] for name in names[side]], 1)
+        check_finite({f"{side} landmarks": points[tracked]}, path)
+        placed = in_layout(torch.from_numpy(points).float().unflatten(1, (-1, 3)), LANDMARKS)
+        sure = torch.from_numpy(table[scores[side]].clip(0, 1)).float()
+        hands[side] = FingerStream(times, placed, torch.from_numpy(tracked), sure)
+    return {side: hand for side, hand in hands.items() if hand.valid.any()}
 
 
 def _wrists(path: Path, head: Trajectory, landmarks: bool, normals: bool) -> dict[str, Trajectory]:

@@ -7,10 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from wearcap.errors import WearcapError
-from wearcap.io.devices.headset_fingers import RawFingers, finger_points
 from wearcap.io.devices.headset_tables import DeviceRows, RawPoses, parts_of
 from wearcap.io.formats.times import check_span, evenly_spread, grain, in_order, in_seconds, without_repeats
 
+Fingers = dict[str, tuple[np.ndarray, np.ndarray]]
+"""By side, times (n,) s and places (n, joint, 3) of a hand's joints in the file's unit and axes."""
 _KINDS = {"wrist": {"wrist"}, "grip": {"grip"}}
 ARKIT = {"origin", "from", "anchor"}
 """Words of visionOS' anchors; those of hands have axes of their own."""
@@ -30,16 +31,16 @@ _TOLERANCE = 0.02, 0.1
 
 def raw_poses(
     rows: dict[str, DeviceRows], time_unit: str | None, axes: str, path: Path
-) -> tuple[dict[str, RawPoses], dict[str, RawFingers], list[str]]:
+) -> tuple[dict[str, RawPoses], Fingers, list[str]]:
     """Poses of the devices over the time in which all of them are tracked, hands by side, and notes of what was mended.
 
     The stated `axes` decide what Euler angles mean: x, y, z are Unity's unless Unreal's are stated, and pitch, yaw, roll
     Unreal's unless Unity's are.
     Raises WearcapError for times that are none, for a head without two poses, and for rotations that are none.
     """
-    hands = {joint.removesuffix("_fingers"): table for joint, table in rows.items() if table.columns.fingers}
+    hands = {joint[:-8]: (found, table.values) for joint, table in rows.items() if (found := table.columns.fingers)}
     rows = {joint: table for joint, table in rows.items() if not table.columns.fingers}
-    clock, poses, fingers = _clock(rows, time_unit, path), dict[str, RawPoses](), dict[str, RawFingers]()
+    clock, poses, fingers = _clock(rows, time_unit, path), dict[str, RawPoses](), Fingers()
     notes, shared = [f"times {_seconds(rows['head'], clock, time_unit, path)[1]} ({clock})"], None
     notes += _angles(rows, axes, path)
     for joint, table in sorted(rows.items()):  # the head first
@@ -63,11 +64,10 @@ def raw_poses(
         poses[joint] = _of_rows(pose, seen)
         if len(poses["head"].seconds) < 2:
             raise WearcapError("no two tracked poses of the headset", path, "positions and rotations")
-        for side, hand in hands.items() if joint == "head" else ():  # in the same file's rows
-            points = finger_points(hand.columns.fingers, hand.values)[kept]
-            frozen = _frozen(RawPoses(seconds, points[:, 0], points, None, None), poses["head"])
-            points[frozen] = np.nan
-            fingers[side] = RawFingers(seconds, points)
+        for side, (found, values) in hands.items() if joint == "head" else ():  # in the same file's rows
+            points = found.points(values)[kept]
+            points[_frozen(RawPoses(seconds, points[:, 0], points, None, None), poses["head"])] = np.nan
+            fingers[side] = seconds, points
     check_span(poses["head"].seconds, path, lambda row: f"pose {row + 1} of the head")
     return _together(poses, notes), fingers, notes
 

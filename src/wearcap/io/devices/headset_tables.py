@@ -92,7 +92,7 @@ class PoseColumns:
     tracked: tuple[Any, ...] = ()
     """Places of flags that are false where the device is lost."""
     fingers: FingerColumns | None = None
-    """Of a hand whose "points" of the joints these are, with no pose of their own."""
+    """Of a hand, whose "points" these are: no pose."""
 
 
 _Layout = tuple[dict[str, Any], Any, dict[str, PoseColumns]]
@@ -291,7 +291,8 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
     if isinstance(value, list):
         if value and all(isinstance(item, dict) for item in value):
             words = (
-                (item, [str(word) for name, word in item.items() if name.lower() in _LABELS]) for item in value[: len(OPENXR)]
+                (item, [str(word) for name, word in item.items() if name.lower() in _LABELS])
+                for item in value[: len(OPENXR)]
             )
             value = {" ".join(named): item for item, named in words if named}
         else:

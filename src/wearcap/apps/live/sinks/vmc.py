@@ -1,13 +1,14 @@
 """The body, and objects, to Unity, Unreal, Blender, VSeeFace and others by the VMC protocol (OSC over UDP, port 39539).
 
-A receiver gets `/VMC/Ext/Root/Pos` and a `/VMC/Ext/Bone/Pos` for each of Unity's humanoid bones, those of fingers where they are captured: position and rotation
-relative to the parent bone, in Unity's axes (left-handed, x right, y up, z forward, metres), of a T-pose without rotations.
+A receiver gets `/VMC/Ext/Root/Pos` and a `/VMC/Ext/Bone/Pos` for each of Unity's humanoid bones (fingers' where they are captured):
+position and rotation relative to the parent bone, in Unity's axes (left-handed, x right, y up, z forward, metres), of a T-pose
+without rotations.
 Objects are trackers: a `/VMC/Ext/Tra/Pos` with the object's name, position and rotation (x y z w) in the world, for each
 that has a pose in the frame. Their own axes are turned like the world's: a mesh's x forward, y left, z up are Unity's z, -x, y.
 """
 
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 
 import numpy as np
@@ -116,11 +117,11 @@ class VmcSink(Sink, Addressed):
         if self._origin_s is None:
             first_s = motion.timestamps[0].item()
             self._origin_s = 0.0 if abs(first_s) < SMALL_S else first_s
-        (positions, rotations), objects, names = bones_of(motion), objects_of(motion), bones_in(motion.skeleton)
+        (positions, rotations), objects = bones_of(motion), objects_of(motion)
         for k, time_s in enumerate(motion.timestamps.tolist()):
             self._pacing.wait(self._step_s, self.waiting > 1)
             trackers = {name: seen.T_world_object for name, seen in objects[k].items()}
-            self._send(bundle(positions[k], rotations[k], time_s - self._origin_s, trackers, names))
+            self._send(bundle(positions[k], rotations[k], time_s - self._origin_s, trackers))
 
     def close(self) -> None:
         if self._socket is not None:
@@ -133,15 +134,10 @@ class VmcSink(Sink, Addressed):
             self.sent += 1
 
 
-def bones_in(skeleton: Skeleton) -> dict[str, str]:
-    """Unity's names of a skeleton's bones with its joints."""
-    return BONES | (FINGER_BONES if has_fingers(skeleton) else {})
-
-
 def bones_of(motion: Motion) -> tuple[Float[Tensor, "time bone 3"], Float[Tensor, "time bone 4"]]:
     """Position and rotation (xyzw) of each of the skeleton's bones relative to its parent, the hips' in the world, in
     Unity's axes."""
-    bones = bones_in(motion.skeleton)
+    bones = BONES | (FINGER_BONES if has_fingers(motion.skeleton) else {})
     names = list(bones)
     pose = motion.T_world_joint[:, motion.skeleton.indices(*bones.values())]
     R, t = UNITY.mT @ pose.R @ UNITY, pose.t @ UNITY
@@ -153,18 +149,14 @@ def bones_of(motion: Motion) -> tuple[Float[Tensor, "time bone 3"], Float[Tensor
 
 
 def bundle(
-    t: Float[Tensor, "bone 3"],
-    xyzw: Float[Tensor, "bone 4"],
-    time_s: float,
-    trackers: Mapping[str, Rigid],
-    names: Iterable[str] = BONES,
+    t: Float[Tensor, "bone 3"], xyzw: Float[Tensor, "bone 4"], time_s: float, trackers: Mapping[str, Rigid]
 ) -> bytes:
-    """One frame of the named bones as an OSC bundle; `trackers`: poses by name in wearcap's world."""
+    """One frame as an OSC bundle; `trackers`: poses by name in wearcap's world."""
     built = OscBundleBuilder(IMMEDIATELY)  # pyright: ignore[reportArgumentType]
     _add(built, "/VMC/Ext/OK", 1, _CALIBRATED, 0)
     _add(built, "/VMC/Ext/T", float(np.float32(time_s)))
     _add(built, "/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    for name, place, turn in zip(names, t.tolist(), xyzw.tolist()):
+    for name, place, turn in zip(BONES | FINGER_BONES, t.tolist(), xyzw.tolist()):
         _add(built, "/VMC/Ext/Bone/Pos", name, *place, *turn)
     for name, pose in trackers.items():
         turn = quat_wxyz_from_matrix((UNITY.mT @ pose.R @ UNITY).double()).roll(-1)

@@ -161,6 +161,8 @@ def _frame(wearer: str, motion: Motion, k: int, objects: dict[str, SeenObject]) 
         "rotations_wxyz": [[round(each, 6) for each in row] for row in wxyz.tolist()],
         "contact": None if contact is None else [round(each, 3) for each in contact[k].tolist()],
     }
+    if motion.fingers_measured is not None:
+        frame["fingers_measured"] = [bool(each) for each in motion.fingers_measured[k].tolist()]
     if objects:
         frame["objects"] = {name: _row(seen) for name, seen in objects.items()}
     return json.dumps(frame)
