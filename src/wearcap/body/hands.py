@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.landmarks import t_pose
-from wearcap.body.skeleton import MIRROR, SIDES, Site, Skeleton
+from wearcap.body.skeleton import MIRROR, SIDES, WRISTS, Site, Skeleton
 from wearcap.body.skeletons import FINGERS, smplh52
 from wearcap.geometry.rotation import about_axis
 
@@ -32,21 +32,15 @@ OPENXR = ("palm", *HAND_JOINTS)
 """The order of XR_EXT_hand_tracking's 26 joints; WebXR's 25 are `HAND_JOINTS`."""
 MEDIAPIPE = tuple(name for name in HAND_JOINTS if not name.endswith("_metacarpal") or name.startswith("thumb"))
 """The order of MediaPipe's 21 landmarks."""
-CHAINS = tuple(
-    tuple(
-        HAND_JOINTS.index(f"{name}_{bone}") for bone in (_BONES[1:] if name != "thumb" else (*_BONES[:2], *_BONES[3:]))
-    )
-    for name in FINGER_NAMES
-)
+CHAINS = tuple(tuple(HAND_JOINTS.index(f"{name}_tip") - k for k in (3, 2, 1, 0)) for name in FINGER_NAMES)
 """Of each finger in `HAND_JOINTS`: start of its first bone, of the next two, and tip."""
 PALM = (0, *(chain[0] for chain in CHAINS[1:]))
 """Wrist and knuckles in `HAND_JOINTS`: the palm, which is rigid."""
 
-ANGLES = ("abduction", "flexion 1", "twist", "flexion 2", "flexion 3")
 _FINGER_LIMITS = ((-30, 30), (-30, 100), (0, 0), (-10, 115), (-15, 90))
 _THUMB_LIMITS = ((-45, 60), (-50, 60), (-60, 60), (-20, 80), (-30, 95))
 LIMITS = torch.tensor([_THUMB_LIMITS, *[_FINGER_LIMITS] * 4], dtype=torch.float64).deg2rad()
-"""Least and greatest of each finger's `ANGLES`, "finger angle 2" (rad): PIP and DIP bend about one axis, knuckles about two;
+"""Least and greatest of each finger's abduction, flexion, twist and two more flexions, "finger angle 2" (rad): PIP and DIP bend about one axis, knuckles about two;
 the thumb's CMC turns about three, within the range of healthy hands (our choice, generous by some 10°)."""
 REST = torch.tensor(
     [(0, 10, 0, 15, 15), (4, 18, 0, 25, 12), (0, 22, 0, 28, 14), (-3, 25, 0, 30, 15), (-6, 27, 0, 30, 15)],
@@ -61,8 +55,7 @@ TIP_SHARE = 0.8
 
 def finger_joints(side: str, finger: str) -> tuple[str, str, str]:
     """Names of SMPL+H's joints of a finger."""
-    first, second, third = (f"{side}_{finger}{k}" for k in (1, 2, 3))
-    return first, second, third
+    return f"{side}_{finger}1", f"{side}_{finger}2", f"{side}_{finger}3"
 
 
 class HandShape(NamedTuple):
@@ -80,11 +73,10 @@ class HandShape(NamedTuple):
 @cache
 def default_shape() -> HandShape:
     """The hand of `smplh52`."""
-    skeleton = smplh52()
-    offsets = skeleton.t_parent_joint.double()
-    rows = [[offsets[skeleton.index(name)] for name in finger_joints("left", finger)] for finger in FINGER_NAMES]
-    bones = torch.stack([torch.stack([row[1].norm(), row[2].norm(), TIP_SHARE * row[2].norm()]) for row in rows])
-    return HandShape(torch.stack([row[0] for row in rows]), bones)
+    offsets = dict(zip(smplh52().joint_names, smplh52().t_parent_joint.double()))
+    first, second, third = (torch.stack([offsets[f"left_{name}{k}"] for name in FINGER_NAMES]) for k in (1, 2, 3))
+    lengths = second.norm(dim=-1), third.norm(dim=-1), TIP_SHARE * third.norm(dim=-1)
+    return HandShape(first, torch.stack(lengths, -1))
 
 
 @cache
@@ -121,12 +113,8 @@ def has_fingers(skeleton: Skeleton) -> bool:
 
 def scaled_shape(skeleton: Skeleton) -> HandShape:
     """The default hand at the size of a skeleton's forearms."""
-    own, default = skeleton, smplh52()
-    lengths = [
-        torch.stack([each.t_parent_joint[each.index(f"{side}_wrist")].norm() for side in SIDES]).mean().item()
-        for each in (own, default)
-    ]
-    return default_shape().scaled(lengths[0] / lengths[1])
+    ours, theirs = (each.t_parent_joint[each.indices(*WRISTS)].norm(dim=-1).mean() for each in (skeleton, smplh52()))
+    return default_shape().scaled((ours / theirs).item())
 
 
 def with_finger_joints(skeleton: Skeleton, shapes: Mapping[str, HandShape]) -> Skeleton:
@@ -138,8 +126,7 @@ def with_finger_joints(skeleton: Skeleton, shapes: Mapping[str, HandShape]) -> S
         wrist, shape = skeleton.index(f"{side}_wrist"), shapes[side]
         for finger in FINGERS:
             row, joints = FINGER_NAMES.index(finger), finger_joints(side, finger)
-            along = shape.bones[row][:, None] * finger_axes()[row, :, 1]
-            places = torch.cat([shape.knuckles[row][None], along])
+            places = torch.cat([shape.knuckles[row, None], shape.bones[row, :, None] * finger_axes()[row, :, 1]])
             places = (places if side == "left" else places * mirror) @ rest[wrist]  # into the wrist's bind axes
             parents += [wrist, len(names), len(names) + 1]
             names += joints

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.recording.recording import Localization
+from wearcap.recording.recording import FingerStream, Localization
 
 
 class HeadSample(NamedTuple):
@@ -44,13 +44,12 @@ class WristSample(NamedTuple):
 
 
 class HandSample(NamedTuple):
-    """Joints of a tracked hand at one time, as `recording.FingerStream` has them; all NaN while it is lost."""
+    """A tracked hand at one time."""
 
     side: str
     timestamp: float
-    points: Float[Tensor, "joint 3"]
-    confidence: float = 1.0
-    rotations: Float[Tensor, "joint 3 3"] | None = None
+    joints: FingerStream
+    """One frame."""
 
 
 class ActiveObject(NamedTuple):

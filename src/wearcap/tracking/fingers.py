@@ -47,7 +47,7 @@ MIN_BONES = 9
 """Least number of bones, of 15, that say something of a hand."""
 SAME_S = 1e-4
 """Times that differ by less are one."""
-_STEPS, _STEP_RAD, _PRIOR = 12, 0.7, 1e-3
+_STEPS, _STEP_RAD, _PRIOR = 15, 0.7, 1e-3
 """Gauss–Newton steps, the longest of an angle, and the weight of the rest pose beside bones of weight 1: it decides what these
 leave open."""
 _CHUNK = 1 << 15
@@ -59,7 +59,7 @@ class FittedHand(NamedTuple):
 
     timestamps: Float64[Tensor, "time"]
     angles: Float64[Tensor, "time finger 5"]
-    """`body.hands.ANGLES`, within their limits in every frame."""
+    """In the order of `body.hands.LIMITS`, and within them in every frame."""
     measured: Bool[Tensor, "time"]
     """Frames in which the hand was tracked and its points are those of a hand; the others' angles mean nothing."""
     shape: HandShape | None
@@ -81,11 +81,7 @@ def fit_hand(stream: FingerStream, side: str) -> FittedHand:
     if not whole.any():
         return FittedHand(stream.timestamps, angles, measured, None, float(tracked.any()))
     hand = _in_hand_axes(points[whole])
-    shape, fitted, error = _shape(hand), [], []
-    for part in hand.split(_CHUNK):
-        found = _fit(part, shape)
-        fitted.append(found[0])
-        error.append(found[1])
+    fitted, error = zip(*(_fit(part, _shape(hand)) for part in hand.split(_CHUNK)))
     angles[whole], measured[whole] = torch.cat(fitted), torch.cat(error) < WORST_RAD
     wrong = 1 - measured.sum().item() / max(1, int(tracked.sum()))
     if not measured.any():
@@ -137,7 +133,7 @@ def _fit(
     weight = ((bones.norm(dim=-1) > LEAST_BONE_M) & bones.isfinite().all(-1)).double()
     seen = torch.nn.functional.normalize(bones.nan_to_num(0.0), dim=-1) @ finger_axes()
     low, high = LIMITS.unbind(-1)
-    angles, prior = _first_guess(seen, weight), _PRIOR * torch.eye(5, dtype=torch.float64)
+    angles, prior = REST.expand(len(hand), -1, -1), _PRIOR * torch.eye(5, dtype=torch.float64)
     for _ in range(_STEPS):
         directions, J = _directions(angles)
         error = (weight[..., None] * (seen - directions)).flatten(-2)
@@ -152,17 +148,6 @@ def _fit(
     total = weight.sum((-1, -2))
     error = ((weight * (2 * (chord / 2).clamp(max=1).asin()).square()).sum((-1, -2)) / total.clamp_min(1)).sqrt()
     return angles, torch.where(total >= MIN_BONES, error, torch.inf)
-
-
-def _first_guess(
-    seen: Float64[Tensor, "time finger bone 3"], weight: Float64[Tensor, "time finger bone"]
-) -> Float64[Tensor, "time finger 5"]:
-    """Flexions by the angles between bones."""
-    angles = REST.expand(len(seen), -1, -1).clone()
-    bends = (seen[..., 1:, :] * seen[..., :-1, :]).sum(-1).clamp(-1, 1).acos()
-    angles[..., 1] = torch.atan2(-seen[..., 0, 2], seen[..., 0, 1]).where(weight[..., 0] > 0, angles[..., 1])
-    angles[..., 3:] = bends.where((weight[..., 1:] > 0) & (weight[..., :-1] > 0), angles[..., 3:])
-    return angles.clamp(*LIMITS.unbind(-1))
 
 
 def _directions(

@@ -1,5 +1,7 @@
 """The tracked hands of one wearer in a live capture: samples in, finger angles out, at any rate of either."""
 
+from dataclasses import replace
+
 import torch
 
 from wearcap.recording import FingerStream
@@ -14,8 +16,9 @@ class LiveHands:
     """Keeps what hands sent; they are fitted when poses become final, all new samples at once."""
 
     def __init__(self) -> None:
-        self._waiting: dict[str, list[HandSample]] = {}
+        self._waiting: dict[str, list[FingerStream]] = {}
         self._fitted: dict[str, FittedHand] = {}
+        self._last_s: dict[str, float] = {}
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
@@ -23,30 +26,22 @@ class LiveHands:
     def take(self, sample: HandSample, time_s: float) -> None:
         """Take in a sample at its time on the leading clock; one that is not later than the last is left out."""
         waiting = self._waiting.setdefault(sample.side, [])
-        known = self._fitted.get(sample.side)
-        last_s = waiting[-1].timestamp if waiting else known.timestamps[-1].item() if known else -torch.inf
-        if time_s > last_s:
-            self._waiting[sample.side] = [*waiting[1 - MAX_WAITING :], sample._replace(timestamp=time_s)]
+        if time_s > self._last_s.get(sample.side, -torch.inf):
+            self._last_s[sample.side] = time_s
+            waiting.append(replace(sample.joints, timestamps=torch.tensor([time_s], dtype=torch.float64)))
+            del waiting[:-MAX_WAITING]
 
     def fitted(self, since_s: float) -> dict[str, FittedHand]:
         """The hands by side, as far as they matter for poses from a time (s) on."""
         for side, waiting in self._waiting.items():
             if waiting:
-                new, known = fit_hand(_stream(waiting), side), self._fitted.get(side)
-                self._waiting[side] = []
-                kept = slice(0) if known is None else known.timestamps > since_s - SHORT_S
-                rows = [torch.cat([a[kept], b]) for a, b in zip((known or new)[:3], new[:3])]
+                columns = zip(*((part.timestamps, part.points, part.valid, part.confidence) for part in waiting))
+                turned = [part.rotations for part in waiting if part.rotations is not None]
+                rotations = torch.cat(turned) if len(turned) == len(waiting) else None
+                new = fit_hand(FingerStream(*map(torch.cat, columns), rotations), side)
+                known = self._fitted.get(side, new)
+                kept = known.timestamps > since_s - SHORT_S if known is not new else slice(0)
+                rows = [torch.cat([a[kept], b]) for a, b in zip(known[:3], new[:3])]
                 self._fitted[side] = FittedHand(*rows, new.shape, new.wrong)
+                waiting.clear()
         return self._fitted
-
-
-def _stream(samples: list[HandSample]) -> FingerStream:
-    points, rotations = torch.stack([each.points for each in samples]), [each.rotations for each in samples]
-    turned = [each for each in rotations if each is not None]
-    return FingerStream(
-        torch.tensor([each.timestamp for each in samples], dtype=torch.float64),
-        points,
-        points.isfinite().any(-1).any(-1),
-        torch.tensor([each.confidence for each in samples]),
-        torch.stack(turned) if len(turned) == len(samples) else None,
-    )

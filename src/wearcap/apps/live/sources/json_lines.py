@@ -31,6 +31,7 @@ from wearcap.body.hands import HAND_JOINTS, MEDIAPIPE, OPENXR, in_layout
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.recording.recording import FingerStream
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, WRONG_TYPE, number_fault, time_fault, values_fault
 from wearcap.sensors.samples import (
     ActiveObject,
@@ -159,7 +160,7 @@ def _sample(device: str, timestamp: float, message: _Message) -> Sample:
         points = None if message.points is None else _points(message.points, message.axes)
         return HeadSample(timestamp, pose, points, floor_height=floor)
     if device in HANDS and (message.joints is not None or message.lost):
-        return HandSample(HANDS[device], timestamp, _joints(message), _confidence(message))
+        return HandSample(HANDS[device], timestamp, _joints(message, timestamp))
     if message.lost:
         raise Fault(NO_POSE)
     if device == CAMERA:
@@ -177,13 +178,13 @@ def _confidence(message: _Message) -> float:
     return max(0.0, message.confidence)
 
 
-def _joints(message: _Message) -> torch.Tensor:
-    """Joints of a hand, "joint 3" (m); NaN of a lost one."""
-    if message.lost or message.joints is None:
-        return torch.full((len(HAND_JOINTS), 3), torch.nan)
-    require(None if len(message.joints) in _LAYOUTS else WRONG_TYPE)
-    points = _points(message.joints, message.axes)
-    return in_layout(points[None], _LAYOUTS[len(points)])[0]
+def _joints(message: _Message, timestamp: float) -> FingerStream:
+    """A hand at one time."""
+    rows = message.joints or [(0.0, 0.0, 0.0)] * len(OPENXR)
+    require(None if len(rows) in _LAYOUTS else WRONG_TYPE)
+    points = in_layout(_points(rows, message.axes)[None], _LAYOUTS[len(rows)])
+    sure, time = torch.tensor([_confidence(message)]), torch.tensor([timestamp], dtype=torch.float64)
+    return FingerStream(time, points, torch.tensor([not message.lost]), sure)
 
 
 def _rotation(message: _Message) -> torch.Tensor:

@@ -165,8 +165,8 @@ class MvnSource(DatagramSource):
         if not sample.seen >= set(range(first, first + len(FINGER_SEGMENTS))):
             return None
         R_world, t_world = self._upright(sample.poses[first : first + len(FINGER_SEGMENTS)])
-        hand = glove_stream(torch.zeros(1).double(), FINGER_SEGMENTS, t_world[None], R_world[None])
-        return HandSample(side, time_s, hand.points[0], rotations=None if hand.rotations is None else hand.rotations[0])
+        at = torch.tensor([time_s], dtype=torch.float64)
+        return HandSample(side, time_s, glove_stream(at, FINGER_SEGMENTS, t_world[None], R_world[None]))
 
     def _upright(self, poses: np.ndarray) -> tuple[Float[Tensor, "segment 3 3"], Float[Tensor, "segment 3"]]:
         """Rotations and positions of segments in a world with z up. Raises Fault for what is none."""
