@@ -257,10 +257,8 @@ class _Fit:
             )
             given[arms[2]] = _axes(middle - wrist, index - pinky) @ _axes(out, eye[0]).T
             for name, (start, end, start_p, end_p) in self.phalanges(side, self.target_t_pose.t.numpy()).items():
-                along, wanted = (
-                    given[arms[2]] @ torch.from_numpy(end - start),
-                    torch.from_numpy(end_p - start_p).double(),
-                )
+                along, wanted = (torch.from_numpy(bone).double() for bone in (end - start, end_p - start_p))
+                along = given[arms[2]] @ along
                 given[self.skeleton.index(name)] = swing_between(along, wanted) @ given[arms[2]]
         turns: list[Tensor] = []  # world rotations of the joints from the T-pose
         for joint, parent in enumerate(self.skeleton.parents):

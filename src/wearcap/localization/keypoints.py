@@ -146,10 +146,7 @@ class MediaPipeHands:
 
     def fingers(self) -> dict[str, FingerStream]:
         """The hands by side in all images so far, as far as they were found."""
-        times, nothing = (
-            torch.tensor([time_s for time_s, _ in self._seen], dtype=torch.float64),
-            np.full((21, 3), np.nan),
-        )
+        nothing, times = np.full((21, 3), np.nan), torch.tensor([at for at, _ in self._seen], dtype=torch.float64)
         streams = {}
         for side in SIDES:
             rows = [found[side].points if side in found else nothing for _, found in self._seen]

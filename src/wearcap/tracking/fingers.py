@@ -45,8 +45,6 @@ WORST_RAD = 0.45
 """Root mean square angle between bones and fit from which on the points are no hand: mirrored, swapped or lost."""
 MIN_BONES = 9
 """Least number of bones, of 15, that say something of a hand."""
-SAME_S = 1e-4
-"""Times that differ by less are one."""
 _STEPS, _STEP_RAD, _PRIOR = 15, 0.7, 1e-3
 """Gauss–Newton steps, the longest of an angle, and the weight of the rest pose beside bones of weight 1: it decides what these
 leave open."""
@@ -76,17 +74,15 @@ def fit_hand(stream: FingerStream, side: str) -> FittedHand:
     whole = (length > PALM_M[0]) & (length < PALM_M[1])  # NaN is neither
     whole &= torch.linalg.cross(index, little).norm(dim=-1) / 2 > LEAST_AREA_M2
     whole &= points[:, PALM, :].isfinite().all(-1).all(-1) & tracked
-    angles = REST.repeat(len(points), 1, 1)
-    measured = torch.zeros_like(whole)
-    if not whole.any():
-        return FittedHand(stream.timestamps, angles, measured, None, float(tracked.any()))
-    hand = _in_hand_axes(points[whole])
-    fitted, error = zip(*(_fit(part, _shape(hand)) for part in hand.split(_CHUNK)))
-    angles[whole], measured[whole] = torch.cat(fitted), torch.cat(error) < WORST_RAD
-    wrong = 1 - measured.sum().item() / max(1, int(tracked.sum()))
-    if not measured.any():
-        return FittedHand(stream.timestamps, angles, measured, None, wrong)
-    return FittedHand(stream.timestamps, angles, measured, _shape(hand[measured[whole]]), wrong)
+    angles, measured, shape = REST.repeat(len(points), 1, 1), torch.zeros_like(whole), None
+    if whole.any():
+        hand = _in_hand_axes(points[whole])
+        shape = _shape(hand)
+        fitted, error = zip(*(_fit(part, shape) for part in hand.split(_CHUNK)))
+        angles[whole], measured[whole] = torch.cat(fitted), torch.cat(error) < WORST_RAD
+        shape = _shape(hand[measured[whole]]) if measured.any() else None
+    wrong = int((tracked & ~measured).sum()) / max(1, int(tracked.sum()))
+    return FittedHand(stream.timestamps, angles, measured, shape, wrong)
 
 
 def _left_points(stream: FingerStream, side: str) -> Float64[Tensor, "time joint 3"]:
@@ -112,24 +108,27 @@ def _in_hand_axes(points: Float64[Tensor, "time joint 3"]) -> Float64[Tensor, "t
 
 def _shape(hand: Float64[Tensor, "time joint 3"]) -> HandShape:
     """Medians over time of knuckles and lengths of bones; what the device lacks is the default hand's at the palm's size."""
-    chains = hand[:, torch.tensor(CHAINS)]
-    knuckles, bones = chains[:, :, 0].nanmedian(0).values, chains.diff(dim=2).norm(dim=-1).nanmedian(0).values
-    default = default_shape()
+    knuckles, default = hand[:, [chain[0] for chain in CHAINS]].nanmedian(0).values, default_shape()
     default = default.scaled((knuckles[1:].norm(dim=-1).mean() / default.knuckles[1:].norm(dim=-1).mean()).item())
-    bones = torch.where(bones > LEAST_BONE_M, bones, default.bones)
-    # A first bone is measured from the knuckle: where that is the default one, so is its distance.
-    first = (chains[:, :, 1] - knuckles.where(knuckles.isfinite(), default.knuckles)).norm(dim=-1).nanmedian(0).values
-    bones[:, 0] = torch.where(knuckles.isfinite().all(-1) | ~first.isfinite(), bones[:, 0], first)
-    return HandShape(torch.where(knuckles.isfinite(), knuckles, default.knuckles), bones)
+    knuckles = knuckles.where(knuckles.isfinite(), default.knuckles)
+    lengths = _bones(hand, knuckles).norm(dim=-1).nanmedian(0).values
+    return HandShape(knuckles, lengths.where((lengths > LEAST_BONE_M) & lengths.isfinite(), default.bones))
+
+
+def _bones(
+    hand: Float64[Tensor, "time joint 3"], knuckles: Float64[Tensor, "finger 3"]
+) -> Float64[Tensor, "time finger bone 3"]:
+    """The bones as vectors (m), the first ones from where the rigid palm has the knuckles."""
+    ends = hand[:, torch.tensor(CHAINS)].clone()
+    ends[:, :, 0] = knuckles
+    return ends.diff(dim=2)
 
 
 def _fit(
     hand: Float64[Tensor, "time joint 3"], shape: HandShape
 ) -> tuple[Float64[Tensor, "time finger 5"], Float64[Tensor, "time"]]:
     """Angles, and the root mean square angle (rad) between the bones and theirs."""
-    chains = hand[:, torch.tensor(CHAINS)]
-    start = shape.knuckles[:, None].expand(len(hand), -1, -1, -1)  # where the rigid palm of the skeleton has them
-    bones = torch.cat([start, chains[:, :, 1:]], 2).diff(dim=2)
+    bones = _bones(hand, shape.knuckles)
     weight = ((bones.norm(dim=-1) > LEAST_BONE_M) & bones.isfinite().all(-1)).double()
     seen = torch.nn.functional.normalize(bones.nan_to_num(0.0), dim=-1) @ finger_axes()
     low, high = LIMITS.unbind(-1)
@@ -187,12 +186,12 @@ def bridged(
     since = (at - times[before]).where(exists[0], torch.inf)
     until = (times[after] - at).where(exists[1], torch.inf)
     keeps = [1 - ((gap - HOLD_S) / FADE_S).clamp(0, 1) for gap in (since, until)]
-    keeps = [share * share * (3 - 2 * share) for share in keeps]
     short = (since + until) <= SHORT_S
     share = (since / (since + until).clamp_min(1e-9)).where(short, 0.0)
-    w_before, w_after = ((1 - share).where(short, keeps[0]), share.where(short, keeps[1]))
+    w_before, w_after = (w * w * (3 - 2 * w) for w in keeps)  # a smooth step
+    w_before, w_after = (1 - share).where(short, w_before), share.where(short, w_after)
     mixed = w_before[:, None, None] * (angles[before] - REST) + w_after[:, None, None] * (angles[after] - REST)
-    near = torch.minimum(since, until) <= SAME_S
+    near = torch.minimum(since, until) <= 1e-4
     return REST + mixed, (near | ((since + until) <= 1.5 * step)).double()
 
 
