@@ -45,7 +45,9 @@ WORST_RAD = 0.45
 """Root mean square angle between bones and fit from which on the points are no hand: mirrored, swapped or lost."""
 MIN_BONES = 9
 """Least number of bones, of 15, that say something of a hand."""
-_STEPS, _STEP_RAD, _PRIOR = 15, 0.7, 1e-3
+BENDS = torch.tensor([0.0, 1.0, 0.0, 1.0, 1.0], dtype=torch.float64)
+"""Of a finger's angles its flexions: the fit starts from the relaxed, the half or the wholly curled finger, whichever is nearest."""
+_STEPS, _STEP_RAD, _PRIOR = 15, 0.5, 1e-3
 """Gauss–Newton steps, the longest of an angle, and the weight of the rest pose beside bones of weight 1: it decides what these
 leave open."""
 _CHUNK = 1 << 15
@@ -132,7 +134,11 @@ def _fit(
     weight = ((bones.norm(dim=-1) > LEAST_BONE_M) & bones.isfinite().all(-1)).double()
     seen = torch.nn.functional.normalize(bones.nan_to_num(0.0), dim=-1) @ finger_axes()
     low, high = LIMITS.unbind(-1)
-    angles, prior = REST.expand(len(hand), -1, -1), _PRIOR * torch.eye(5, dtype=torch.float64)
+    starts = torch.stack([REST + curl * BENDS * (high - REST) for curl in (0.0, 0.4, 0.8)])
+    far = (weight[:, None, ..., None] * (seen[:, None] - _directions(starts)[0])).square().sum((-1, -2))
+    nearest = far.argmin(1)[..., None].expand(-1, -1, 5)
+    angles = starts.expand(len(hand), -1, -1, -1).gather(1, nearest[:, None])[:, 0]
+    prior = _PRIOR * torch.eye(5, dtype=torch.float64)
     for _ in range(_STEPS):
         directions, J = _directions(angles)
         error = (weight[..., None] * (seen - directions)).flatten(-2)

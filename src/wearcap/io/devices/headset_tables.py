@@ -291,7 +291,14 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
     if isinstance(value, list):
         if value and all(isinstance(item, dict) for item in value):
             words = (
-                (item, [str(word) for name, word in item.items() if name.lower() in _LABELS])
+                (
+                    item,
+                    [
+                        str(word)
+                        for name, word in item.items()
+                        if name.lower() in _LABELS and not isinstance(word, dict)
+                    ],
+                )
                 for item in value[: len(OPENXR)]
             )
             value = {" ".join(named): item for item, named in words if named}
