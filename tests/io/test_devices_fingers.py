@@ -160,7 +160,9 @@ def test_mps_landmarks(tmp_path):
 
 @pytest.mark.real
 def test_a_real_mps_sample(real_data):
-    hands = read_mps(real_data / "aria_mps").fingers
+    folder = real_data / "aria_mps"
+    assert read_mps(folder).fingers == {}  # of another time than the trajectory
+    hands = read_fingers([folder / "hand_tracking/hand_tracking_results_v2.csv"])
     assert set(hands) == set(SIDES)
     for side, hand in hands.items():
         fitted = fit_hand(hand, side)

@@ -187,9 +187,13 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
     files = _found(folder, *_HANDS)
     wrists, note = read_hands(files, track)
     name, points = Path(folder).resolve().name, read_mps_points(folder)
-    return Recording(
-        name, head, points=points, tracked=wrists, fingers=read_fingers(files), source="Aria MPS", note=note
-    )
+    first, last = track.timestamps[[0, -1]]
+    fingers = {
+        side: hand
+        for side, hand in read_fingers(files).items()
+        if (hand.valid & (hand.timestamps >= first) & (hand.timestamps <= last)).any()
+    }
+    return Recording(name, head, points=points, tracked=wrists, fingers=fingers, source="Aria MPS", note=note)
 
 
 def read_mps_points(folder: str | Path) -> PointCloud | None:

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.apps.live.packets import HANDS, SUIT, Packet
-from wearcap.apps.live.source import Address, DatagramSource, Fault, require
+from wearcap.apps.live.source import Address, DatagramSource, Fault, counted, require
 from wearcap.apps.live.sources.parts import UNIT_TOLERANCE
 from wearcap.body.hands import HAND_JOINTS
 from wearcap.body.kinematics import local_rotations
@@ -132,10 +132,9 @@ class MvnSource(DatagramSource):
             wearer = self.wearer if number == 0 else f"{self.wearer or 'character'} {number}"
             yield Packet(wearer, SUIT, self.name, time_ms / 1000, arrived_s, SuitPiece(motion))
             for k, device in enumerate(HANDS if fingers == 2 * len(FINGER_SEGMENTS) else ()):
-                hand = self._hand(
-                    sample, len(SEGMENTS) + props + k * len(FINGER_SEGMENTS), HANDS[device], time_ms / 1000
-                )
-                if hand is not None:
+                first = len(SEGMENTS) + props + k * len(FINGER_SEGMENTS)
+                with counted(refuse):  # a glove that fails takes no body with it
+                    hand = self._hand(sample, first, HANDS[device], time_ms / 1000)
                     yield Packet(wearer, device, self.name, time_ms / 1000, arrived_s, hand)
 
     def _joined(self, character: _Character, counter: int, part: int, data: bytes, items: int) -> _Sample | None:
@@ -160,10 +159,9 @@ class MvnSource(DatagramSource):
         character.newest = counter
         return sample
 
-    def _hand(self, sample: _Sample, first: int, side: str, time_s: float) -> HandSample | None:
-        """A glove's hand, whose segments begin at a number from 0; None for one that is not whole."""
-        if not sample.seen >= set(range(first, first + len(FINGER_SEGMENTS))):
-            return None
+    def _hand(self, sample: _Sample, first: int, side: str, time_s: float) -> HandSample:
+        """A glove's hand, whose segments begin at a number from 0. Raises Fault for one that is not whole."""
+        require(None if sample.seen >= set(range(first, first + len(FINGER_SEGMENTS))) else INCOMPLETE)
         R_world, t_world = self._upright(sample.poses[first : first + len(FINGER_SEGMENTS)])
         at = torch.tensor([time_s], dtype=torch.float64)
         return HandSample(side, time_s, glove_stream(at, FINGER_SEGMENTS, t_world[None], R_world[None]))
