@@ -23,7 +23,7 @@ from wearcap.recording.recording import CameraStream, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearsim.sensors.keypoints import action_camera, camera_path, seen_joints
 
-VERSION = 2
+VERSION = 3
 """Version of the conversion, increased when the same recording and settings yield another one."""
 FLOW = FlowSettings()
 CAMERA_FPS = 30.0
@@ -32,7 +32,7 @@ CAMERA_FPS = 30.0
 
 @dataclass(frozen=True)
 class Found:
-    """Wrists detected by MediaPipe in the head camera's pictures, tracked by optical flow where detections are missing."""
+    """Wrists, with their fingers, detected by MediaPipe in the head camera's pictures, tracked by optical flow where detections are missing."""
 
     model: str | None = None
     flow: FlowSettings = field(default_factory=FlowSettings)
@@ -41,7 +41,7 @@ class Found:
         camera = _camera(recording)
         detector = MediaPipeHands(self.model)
         cues = tracked_cues(pictures(camera, folder), camera.timestamps, detector, self.flow)
-        return replace(recording, cues=recording.cues | cues)
+        return replace(recording, cues=recording.cues | cues, fingers=recording.fingers | detector.fingers())
 
     def settings(self, name: str) -> list[Any]:
         return ["mediapipe", find_model(self.model), asdict(self.flow)]

@@ -57,7 +57,7 @@ def matrices(device: str) -> np.ndarray:
 
 def compare(path: Path, start: float | None = TIME[0], scale=1.0, within=2e-6, late=1e-3, turned=0.02, devices=SIDES):
     """Raw poses as they were written: positions within rounding, times to 1 ms (their difference where no start is known)."""
-    poses, convention, notes = read_raw_poses(path)
+    poses, _, convention, notes = read_raw_poses(path)
     assert set(poses) == set(devices)
     for joint, device in devices.items():
         pose, (turn, at) = poses[joint], POSES[device]

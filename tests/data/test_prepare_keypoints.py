@@ -134,6 +134,9 @@ def test_a_detector_is_shown_every_picture(filmed, tmp_path, monkeypatch):
             x, y = way()[self.shown - 1].tolist()
             return {JOINT: Keypoint(x, y, 0.9)} if self.shown % 7 == 1 else {}
 
+        def fingers(self):
+            return {}
+
     monkeypatch.setattr(keypoints, "MediaPipeHands", Every7th)
     (tmp_path / "m.task").write_bytes(b"")
     report = keypoints_dataset(filmed.root, tmp_path / "new", Found(str(tmp_path / "m.task")), backend="threading")

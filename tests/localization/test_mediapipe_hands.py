@@ -6,6 +6,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
+from wearcap.body.hands import FINGER_NAMES, HAND_JOINTS
 from wearcap.errors import WearcapError
 from wearcap.localization.keypoints import MODEL_VARIABLE, Detector, MediaPipeHands, _Hand, wearers_hands
 
@@ -22,7 +23,7 @@ def side(name: str, score: float) -> list[SimpleNamespace]:
 def package(monkeypatch, tmp_path):
     """A package with the parts of MediaPipe's interface that are used; `answer` is its next one."""
     fake = ModuleType("mediapipe")
-    fake.answer = SimpleNamespace(hand_landmarks=[], handedness=[])
+    fake.answer = SimpleNamespace(hand_landmarks=[], handedness=[], hand_world_landmarks=[])
     fake.shown = []
 
     class Landmarker:
@@ -57,12 +58,18 @@ def test_wrists_are_pixels_of_the_wearers_hands(package):
     package.answer = SimpleNamespace(
         hand_landmarks=[[mark(0.75, 0.5), mark(0, 0)], [mark(0.25, 0.8), mark(0, 0)]],
         handedness=[side("Right", 0.97), side("Left", 0.9)],
+        hand_world_landmarks=[[SimpleNamespace(x=k / 100, y=sign, z=0.0) for k in range(21)] for sign in (1.0, -1.0)],
     )
     found = detector(picture, 0.0333)
     assert found["right_wrist"][:2] == pytest.approx((149.5, 49.5))
     assert found["left_wrist"][:2] == pytest.approx((49.5, 79.5))
     assert all(0.9 < keypoint.confidence <= 1 for keypoint in found.values())
     assert package.shown == [((100, 200, 3), 0), ((100, 200, 3), 33)]
+    hands = detector.fingers()
+    assert {name: hand.points[1, 0, 1].item() for name, hand in hands.items()} == {"left": -1.0, "right": 1.0}
+    assert hands["left"].valid.tolist() == [False, True]
+    tips = [hands["left"].points[1, HAND_JOINTS.index(f"{finger}_tip"), 0].item() for finger in FINGER_NAMES]
+    assert tips == pytest.approx([0.04, 0.08, 0.12, 0.16, 0.20])  # MediaPipe's landmarks 4, 8, 12, 16, 20
 
 
 def test_two_hands_are_never_of_one_side():

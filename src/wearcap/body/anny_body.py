@@ -146,9 +146,8 @@ def _joint_of(bone: str, skeleton: Skeleton, pose: TPose) -> int:
     if bone.startswith("toe"):
         toe = marks.toe[side]
         return marks.limb[f"{side}_leg"][2] if toe is None else toe
-    named = f"{side}_{_FINGERS.get(bone[:7], '')}{bone[8:9]}"
-    if bone.startswith("finger") and named in skeleton:
-        return skeleton.index(named)
+    if _phalanx(bone) in skeleton:
+        return skeleton.index(_phalanx(bone))
     if bone == "lowerarm02.L" or bone == "lowerarm02.R":
         return marks.forearm[side]
     for word, (limb, place) in _LIMBS.items():
@@ -257,12 +256,33 @@ class _Fit:
                 torch.from_numpy(self.person[f"{side[0]}-finger-{n}-1"]).double() for n in (2, 3, 5)
             )
             given[arms[2]] = _axes(middle - wrist, index - pinky) @ _axes(out, eye[0]).T
+            for name, (start, end, start_p, end_p) in self.phalanges(side, self.target_t_pose.t.numpy()).items():
+                along, wanted = (torch.from_numpy(bone).double() for bone in (end - start, end_p - start_p))
+                along = given[arms[2]] @ along
+                given[self.skeleton.index(name)] = swing_between(along, wanted) @ given[arms[2]]
         turns: list[Tensor] = []  # world rotations of the joints from the T-pose
         for joint, parent in enumerate(self.skeleton.parents):
             trunk = joint in (marks.root, marks.head, *marks.spine, *marks.neck) or joint in marks.collar.values()
             turns.append(given[joint] if joint in given else eye if trunk or parent < 0 else turns[parent])
         R = torch.stack(turns) @ self.target_t_pose.R
         return forward_kinematics(self.skeleton, local_rotations(self.skeleton, R), torch.zeros(3, dtype=R.dtype))
+
+    def phalanges(self, side: str, t: Float[np.ndarray, "joint 3"]) -> dict[str, tuple[np.ndarray, ...]]:
+        """Start and end of each bone of the skeleton's fingers by its joint, for joints at `t`, and those of the person's.
+
+        There are none of a skeleton without fingers. A last bone, with no joint at its end, goes on as the one before.
+        """
+        ends: dict[str, tuple[np.ndarray, ...]] = {}
+        for bone, finger in _FINGERS.items():
+            joints = [f"{side}_{finger}{k}" for k in (1, 2, 3)]
+            if set(joints) <= set(self.skeleton.joint_names):
+                ours, tip = [t[self.skeleton.index(joint)] for joint in joints], f"{side}_{finger}_tip"
+                length, before = _length(ours[1:]), ours[2] - ours[1]
+                site = self.skeleton.sites.get(tip)
+                ours.append(ours[2] + before / length * (np.linalg.norm(site.t_joint_site) if site else 0.8 * length))
+                theirs = [self.person[f"{side[0]}-finger-{bone[6]}-{k}"] for k in range(1, 5)]
+                ends |= {name: (*ours[k : k + 2], *theirs[k : k + 2]) for k, name in enumerate(joints)}
+        return ends
 
     def foot_yaw(self, side: str) -> Float[np.ndarray, "3 3"]:
         """Rotation about z by which the person's foot points outwards."""
@@ -304,12 +324,20 @@ def _fit_to(fit: _Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3
             f"{side}_lowerarm": _stretched(surface, (elbow_p, wrist_p), (elbow, wrist), fit.girth),
             f"{side}_hand": wrist + hand * (surface - wrist_p),
         }
-    group = [_group(bone) for bone in assets.bones]
+        for name, ends in fit.phalanges(side, t).items():
+            parts[name] = _stretched(surface, ends[2:], ends[:2], hand)
+    group = [_phalanx(bone) if _phalanx(bone) in parts else _group(bone) for bone in assets.bones]
     total = np.zeros_like(surface)
     for name, moved in parts.items():
         own = assets.weights[:, [g == name for g in group]].sum(1, keepdims=True)
         total += own * moved
     return total
+
+
+def _phalanx(bone: str) -> str:
+    """SMPL+H's name of the joint that a bone of a finger starts at; "" for other bones."""
+    side = {"L": "left", "R": "right"}.get(bone[-1], "")
+    return f"{side}_{_FINGERS[bone[:7]]}{bone[8:9]}" if bone[:7] in _FINGERS else ""
 
 
 def _group(bone: str) -> str:

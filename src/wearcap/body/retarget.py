@@ -14,6 +14,7 @@ from torch import Tensor
 from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.landmarks import TPose, t_pose
 from wearcap.body.skeleton import SIDES, Site, Skeleton
+from wearcap.body.skeletons import FINGER_JOINTS
 from wearcap.geometry.rotation import swing_between
 
 
@@ -81,7 +82,10 @@ def retarget(
     pose_s, pose_t = t_pose(source), t_pose(target)
     T_world_source = forward_kinematics(source, R_parent_joint, t_world_root)
     turn = T_world_source.R @ pose_s.R.to(T_world_source.R).transpose(-1, -2)
-    R_world = _carry(turn, pose_s, pose_t, target.parents) @ pose_t.R.to(turn)
+    turns = _carry(turn, pose_s, pose_t, target.parents)
+    shared = [name for name in FINGER_JOINTS if name in source and name in target]
+    turns[..., target.indices(*shared), :, :] = turn[..., source.indices(*shared), :, :]
+    R_world = turns @ pose_t.R.to(turn)
     hips = [pose_s.marks.limb[f"{side}_leg"][0] for side in SIDES]
     centre = T_world_source.t[..., hips, :].mean(-2)
     t_root = centre - (R_world[..., 0, :, :] @ pose_t.hip_centre.to(centre)[:, None])[..., 0]

@@ -30,7 +30,7 @@ _SMPL_BODY = (
     ("left_elbow", "left_shoulder", (0.0, 0.290, 0.0)), ("right_elbow", "right_shoulder", (0.0, -0.290, 0.0)),
     ("left_wrist", "left_elbow", (0.0, 0.250, 0.0)), ("right_wrist", "right_elbow", (0.0, -0.250, 0.0)),
 )  # fmt: skip
-_FINGERS = {
+FINGERS = {
     "index": ((0.025, 0.085, 0.0), 0.032),
     "middle": ((0.003, 0.088, 0.0), 0.034),
     "pinky": ((-0.038, 0.072, -0.004), 0.022),
@@ -40,10 +40,14 @@ _FINGERS = {
 """SMPL+H's order of fingers: first knuckle from the wrist, length of each of the two bones that follow (m)."""
 
 
+FINGER_JOINTS = tuple(f"{side}_{finger}{k}" for side in ("left", "right") for finger in FINGERS for k in (1, 2, 3))
+"""SMPL+H's finger joints, in its order."""
+
+
 def _hand(side: str) -> list[tuple[str, str, tuple[float, float, float]]]:
     y = 1.0 if side == "left" else -1.0
     rows = []
-    for finger, (knuckle, bone) in _FINGERS.items():
+    for finger, (knuckle, bone) in FINGERS.items():
         along = (0.6 * bone, 0.8 * bone, 0.0) if finger == "thumb" else (0.0, bone, 0.0)
         for joint in (1, 2, 3):
             parent = f"{side}_wrist" if joint == 1 else f"{side}_{finger}{joint - 1}"

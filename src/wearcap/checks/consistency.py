@@ -17,6 +17,7 @@ from wearcap.io.formats.video import video_info
 from wearcap.recording import (
     CameraStream,
     Cue,
+    FingerStream,
     FloorTrack,
     HeadStream,
     ImuStream,
@@ -29,6 +30,7 @@ from wearcap.scene.floor import estimate_floor
 from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.imu import GRAVITY, mean_filter
 from wearcap.sensors.initialization import MAX_SPEED
+from wearcap.tracking.fingers import fit_hand
 
 LONG_OUTAGE_S = 30.0
 REACH_M = (0.05, 1.3)
@@ -120,6 +122,26 @@ def check_hand(joint: str, hand: Trajectory, head: HeadStream) -> Finding:
         fix = "Say the unit of length (unit=cm, mm …), or take head and hands of one session."
         return check.error("out of an arm's reach" if usual > 1 else "lies in the head", evidence, fix)
     return check.ok("within an arm's reach", evidence)
+
+
+MOST_WRONG = 0.3
+"""Largest share of tracked frames in which a hand's points may be those of no such hand."""
+
+
+def check_fingers(side: str, stream: FingerStream, head: HeadStream | None) -> Finding:
+    """How much of a tracked hand is seen, and whether its points are a hand of this side."""
+    check, times = Check(f"{side} fingers"), stream.timestamps
+    if not len(times) or not (times.isfinite().all() and (times.diff() > 0).all()):
+        return check.error("timestamps are none, or do not rise", "", "Sort the frames by time.")
+    if head is not None and (times[-1] < head.timestamps[0] or times[0] > head.timestamps[-1]):
+        evidence = f"{times[0]:.2f} … {times[-1]:.2f} s"
+        return check.warning("share no time with the head, and rest", evidence, "Bring both to one clock.")
+    hand = fit_hand(stream, side)
+    seen, evidence = f"are measured in {100 * hand.measured.double().mean():.0f} % of", f"{len(times)} frames"
+    if hand.wrong > MOST_WRONG:
+        evidence += f", of the tracked ones {100 * hand.wrong:.0f} % do not bend as a {side} hand"
+        return check.warning(seen, evidence, "Are left and right, or left- and right-handed axes, mixed up?")
+    return check.ok(seen, evidence)
 
 
 def check_carried(head: HeadStream, floor: FloorTrack) -> list[Finding]:

@@ -13,6 +13,7 @@ from wearcap.checks.consistency import (
     check_camera,
     check_carried,
     check_claps,
+    check_fingers,
     check_hand,
     check_head_against_body,
     check_head_cue,
@@ -73,6 +74,7 @@ def examine_recording(recording: Recording) -> list[Finding]:
         findings += [check_hand(joint, hand, head) for joint, hand in recording.tracked.items() if len(hand)]
         if recording.floor is not None and len(recording.floor.timestamps):
             findings += check_carried(head, recording.floor)
+    findings += [check_fingers(side, hand, head) for side, hand in recording.fingers.items()]
     if head is not None and "head" in recording.cues:
         findings.append(check_head_cue(head, recording.cues["head"]))
     for name, imu in recording.imu.items():

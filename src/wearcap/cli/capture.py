@@ -53,6 +53,7 @@ from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, LearnedSystem, StageOptions, System
 from wearcap.runtime.walked_stature import with_walked_stature
 from wearcap.scene.objects import Environment
+from wearcap.tracking.fingers import with_fingers
 from wearcap.tracking.stature import skeleton_of, with_stature
 
 
@@ -95,7 +96,8 @@ def captured(config: Any, system: System) -> Motion | None:
         if recording.origin is not None:
             motion.provenance.update(origin=" ".join(map(str, recording.origin.tolist())))
         environment = None if motion.object_motion is None else system.objects(source)
-        _write(motion, source, environment, folder, config)
+        whole = with_fingers(motion, recording.fingers)  # of every system's motion, as far as the recording has hands
+        _write(whole, source, environment, folder, config)
         if (knee_deg := crouches(motion)) is not None:
             show(
                 f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"
@@ -109,12 +111,13 @@ def captured(config: Any, system: System) -> Motion | None:
             draws = {}
             for number, seed in enumerate(track(seeds, description="samples")):
                 draws[f"sample {number}"] = draw = drawing(source, seed)
-                write_motion(draw, folder / f"sample-{number}.npz")
+                write_motion(with_fingers(draw, recording.fingers), folder / f"sample-{number}.npz")
             body, rows = anny_body(motion.skeleton, recording.shape or None), shown | {"mean": motion} | draws
             save_png(folder / "samples.png", contact_sheet(rows, body=body, environment=environment))
         if filmed_s:
-            body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
-            shown |= {"capture": motion}
+            drawn = whole if truth is None else motion  # one surface fits both
+            body = anny_body(drawn.skeleton, recording.shape or None) if config.body else None
+            shown |= {"capture": drawn}
             write_video(folder / "motion.mp4", shown, body=body, environment=environment, max_seconds=filmed_s)
     return motion
 

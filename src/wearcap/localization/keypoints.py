@@ -14,11 +14,13 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
+from wearcap.body.hands import MEDIAPIPE, in_layout
+from wearcap.body.skeleton import SIDES
 from wearcap.errors import WearcapError
 from wearcap.io.formats.csv_table import read_columns, read_header
-from wearcap.recording.recording import Cue
+from wearcap.recording.recording import Cue, FingerStream
 
 MODEL_VARIABLE = "WEARCAP_HANDS_MODEL"
 """Environment variable with the path of `hand_landmarker.task`."""
@@ -92,10 +94,12 @@ class _Hand(NamedTuple):
     """Vertical wrist position, as a share of the image's height."""
     left: float
     """Probability that it is a left hand."""
+    points: Float[np.ndarray, "point 3"] | None = None
+    """The 21 landmarks (m) in camera axes, from the hand's middle."""
 
 
 class MediaPipeHands:
-    """Wrists of up to two hands, tracked by MediaPipe from image to image: one object per video."""
+    """Wrists, and fingers, of up to two hands, tracked by MediaPipe from image to image: one object per video."""
 
     joints = ("left_wrist", "right_wrist")
 
@@ -109,6 +113,7 @@ class MediaPipeHands:
         except ModuleNotFoundError as error:
             fix = 'pip install "wearcap[hands]", or take detector=recorded, which needs none.'
             raise WearcapError(f"MediaPipe's hands need the package {error.name!r}", fix=fix) from error
+        self._seen: list[tuple[float, dict[str, _Hand]]] = []
         vision, path = self._mediapipe.tasks.vision, find_model(model)
         options = vision.HandLandmarkerOptions(
             base_options=self._mediapipe.tasks.BaseOptions(model_asset_path=str(path)),
@@ -128,15 +133,27 @@ class MediaPipeHands:
         image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture))
         result = self._landmarker.detect_for_video(image, round(1000 * time_s))
         hands = []
-        for marks, side in zip(result.hand_landmarks, result.handedness):
+        for marks, side, places in zip(result.hand_landmarks, result.handedness, result.hand_world_landmarks):
             # MediaPipe names the person's own side in a picture that is not mirrored, as a head camera's is.
             left = side[0].score if side[0].category_name == "Left" else 1.0 - side[0].score
-            hands.append(_Hand(marks[WRIST].x, marks[WRIST].y, left))
-        height, width = picture.shape[:2]
+            points = np.array([(place.x, place.y, place.z) for place in places], np.float32)
+            hands.append(_Hand(marks[WRIST].x, marks[WRIST].y, left, points))
+        (height, width), found = picture.shape[:2], wearers_hands(hands)
+        self._seen.append((time_s, {joint.split("_")[0]: hand for joint, (hand, _) in found.items()}))
         return {
-            joint: Keypoint(hand.x * width - 0.5, hand.y * height - 0.5, sure)
-            for joint, (hand, sure) in wearers_hands(hands).items()
+            joint: Keypoint(hand.x * width - 0.5, hand.y * height - 0.5, sure) for joint, (hand, sure) in found.items()
         }
+
+    def fingers(self) -> dict[str, FingerStream]:
+        """The hands by side in all images so far, as far as they were found."""
+        nothing, times = np.full((21, 3), np.nan), torch.tensor([at for at, _ in self._seen], dtype=torch.float64)
+        streams = {}
+        for side in SIDES:
+            rows = [found[side].points if side in found else nothing for _, found in self._seen]
+            points = in_layout(torch.tensor(np.array(rows), dtype=torch.float32).reshape(-1, 21, 3), MEDIAPIPE)
+            valid = points[:, 0, 0].isfinite()
+            streams[side] = FingerStream(times, points, valid, valid.float())
+        return {side: stream for side, stream in streams.items() if stream.valid.any()}
 
 
 def wearers_hands(hands: Sequence[_Hand]) -> dict[str, tuple[_Hand, float]]:

@@ -280,6 +280,7 @@ class HeadsetSettings:
             name,
             head=head,
             tracked=log.wrists,
+            fingers=log.fingers,
             floor=FloorTrack(head.timestamps[:1], torch.zeros(1)) if log.floor else None,
             skeleton=None if self.height is None else skeleton_of_height(float(self.height)),
             note="; ".join(notes),

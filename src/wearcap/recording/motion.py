@@ -66,7 +66,7 @@ def reach(share: float, dof: float | None) -> float:
     return float(special.stdtrit(dof, (1 + share) / 2) / special.stdtrit(dof, special.ndtr(1.0)))
 
 
-ESTIMATES = ("contact_prob", "hand_contact_prob", "body_contact_prob", "joint_std")
+ESTIMATES = ("contact_prob", "hand_contact_prob", "body_contact_prob", "joint_std", "fingers_measured")
 """Optional fields of a Motion with a row per frame."""
 PER_FRAME = ("timestamps", "R_parent_joint", "t_world_root", *ESTIMATES)
 
@@ -96,6 +96,8 @@ class Motion:
     errors the standard deviation."""
     joint_dof: float | None = None
     """Degrees of freedom of Student's t distribution that these errors follow; None: they are normal."""
+    fingers_measured: Float[Tensor, "time hand"] | None = None
+    """1 where the fingers of each of `HANDS` follow a tracked hand; 0 where they are bridged, or at rest. None without fingers."""
 
     def __len__(self) -> int:
         return len(self.timestamps)

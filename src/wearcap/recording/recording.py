@@ -113,6 +113,23 @@ class Cue:
 
 
 @dataclass(frozen=True)
+class FingerStream:
+    """Joints of one tracked hand, in the order of `body.hands.HAND_JOINTS`."""
+
+    timestamps: Float64[Tensor, "time"]
+    points: Float[Tensor, "time joint 3"]
+    """Places (m), NaN for joints that the device lacks. Their right-handed axes are the device's own and may turn from frame
+    to frame: only how the joints of a frame lie to each other is used."""
+    valid: Bool[Tensor, "time"]
+    """Whether the hand was tracked."""
+    confidence: Float[Tensor, "time"]
+    """As the device gives it, 0…1; 1 where it gives none."""
+    rotations: Float[Tensor, "time joint 3 3"] | None = None
+    """Rotations of the joints in the same axes, where the device measures them: of a flat hand in the T-pose all are those
+    of the wrist joint (y along the left hand's fingers and against the right one's, z out of the back), in a wrist's rest axes."""
+
+
+@dataclass(frozen=True)
 class ContactTrack:
     """True contacts of named parts (`FOOT_PATCHES`, hands) over time."""
 
@@ -163,6 +180,8 @@ class Recording:
     cues: dict[str, Cue] = field(default_factory=dict)
     tracked: dict[str, Trajectory] = field(default_factory=dict)
     """Poses of tracked joints, such as wrists by controllers, by the skeleton's joint names."""
+    fingers: dict[str, FingerStream] = field(default_factory=dict)
+    """Tracked hands by side, "left" and "right"."""
     scene: str | None = None
     """File of the surroundings' geometry (.ply or .glb), relative to the data set's directory."""
     environment: str | None = None

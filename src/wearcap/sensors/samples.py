@@ -7,7 +7,7 @@ from torch import Tensor
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.recording.recording import Localization
+from wearcap.recording.recording import FingerStream, Localization
 
 
 class HeadSample(NamedTuple):
@@ -41,6 +41,15 @@ class WristSample(NamedTuple):
     joint: str
     timestamp: float
     T_world_joint: Rigid
+
+
+class HandSample(NamedTuple):
+    """A tracked hand at one time."""
+
+    side: str
+    timestamp: float
+    joints: FingerStream
+    """One frame."""
 
 
 class ActiveObject(NamedTuple):

@@ -25,7 +25,7 @@ from wearcap.apps.live.source import Source
 from wearcap.apps.live.status import Ask, LiveStatus
 from wearcap.apps.live.wearer import LiveWearer, Opener
 from wearcap.apps.web.sockets import LoopThread
-from wearcap.body.skeleton import xsens23
+from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion, Recording
@@ -115,8 +115,8 @@ class LiveCapture:
         self.inbox = Inbox()
         self.wearers = Recent(MAX_WEARERS, self._new_wearer, self._is_captured)
         self.sinks = [SinkThread(sink) for sink in sinks]
-        self._begun: set[str] = set()
-        """Wearers whose motion the sinks take."""
+        self._begun: dict[str, Skeleton] = {}
+        """Skeletons of the wearers whose motion the sinks take."""
         self._record, self._recordings, self._recording = record, recordings, None
         self._recorders: list[SinkThread] = []
         """All recorders of this capture; while `_recording` names a folder the last of them records in it."""
@@ -211,7 +211,7 @@ class LiveCapture:
                 self.inbox.refuse("capture", "a wearer more than this machine captures")
             else:
                 wearer.take(packet)
-                if wearer.session is not None and wearer.name not in self._begun:
+                if wearer.session is not None and self._begun.get(wearer.name) is not wearer.skeleton:
                     self._begin(wearer)
         now_s = time.monotonic()
         for wearer in self.wearers.values():
@@ -263,7 +263,7 @@ class LiveCapture:
     def _begin(self, wearer: LiveWearer) -> None:
         """A wearer's motion begins; what the first minute found is kept."""
         assert wearer.skeleton is not None
-        self._begun.add(wearer.name)
+        self._begun[wearer.name] = wearer.skeleton
         for sink in self._all_sinks():
             sink.begin(wearer.name, wearer.skeleton, wearer.fps)
         path = self.known.file_of(wearer.name)
@@ -280,7 +280,7 @@ class LiveCapture:
             if left:
                 sink.end(wearer.name)
         if left:
-            self._begun.remove(wearer.name)
+            del self._begun[wearer.name]
 
     def _all_sinks(self) -> list[SinkThread]:
         return [*self.sinks, *(self._recorders[-1:] if self._recording is not None else ())]

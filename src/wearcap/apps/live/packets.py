@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from wearcap.sensors.samples import (
     ActiveObject,
+    HandSample,
     HeadSample,
     LocalizationSample,
     ObjectSample,
@@ -22,7 +23,11 @@ HEAD, SUIT, CAMERA = "head", "suit", "camera"
 """Names of devices that say by themselves what they are; wrists are named by their joint, others by their serial."""
 OBJECT = "object"
 """Device of samples of objects, with the object's name behind it where there is one."""
-Sample = HeadSample | WatchSample | WristSample | SuitPiece | LocalizationSample | ActiveObject | ObjectSample
+HANDS = {"left_hand": "left", "right_hand": "right"}
+"""Devices of samples of hands, and their sides."""
+Sample = (
+    HeadSample | HandSample | WatchSample | WristSample | SuitPiece | LocalizationSample | ActiveObject | ObjectSample
+)
 
 
 class Packet(NamedTuple):

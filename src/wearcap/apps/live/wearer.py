@@ -12,11 +12,13 @@ from torch import Tensor
 
 from wearcap.apps.live.clocks import Clocks
 from wearcap.apps.live.devices import MAX_DEVICES, Device
+from wearcap.apps.live.hands import LiveHands
 from wearcap.apps.live.packets import HEAD, SUIT, Packet
 from wearcap.apps.live.recent import Recent
 from wearcap.apps.live.setup import Seat, Setup
 from wearcap.apps.live.setup_estimation import SetupEstimation
 from wearcap.apps.live.status import MAX_POINTS, Counts, Latencies, Stage, WearerStatus
+from wearcap.body.hands import has_fingers
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -26,6 +28,7 @@ from wearcap.runtime.session import Session
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors.samples import (
     ActiveObject,
+    HandSample,
     HeadSample,
     LocalizationSample,
     ObjectSample,
@@ -33,6 +36,7 @@ from wearcap.sensors.samples import (
     WatchSample,
     WristSample,
 )
+from wearcap.tracking.fingers import fingered, posed
 from wearcap.tracking.head_path import MAX_GAP_S
 
 AWAY_S = 5.0
@@ -99,6 +103,7 @@ class LiveWearer:
         """The newest choice of the active object."""
         self._taken = self._taken_before = False
         """Whether the session, and an earlier one, took that choice."""
+        self._hands = LiveHands()
         self._held: deque[HeadSample] = deque(maxlen=MAX_HELD)
         """Samples of the head that wait for the latest watch."""
 
@@ -115,6 +120,11 @@ class LiveWearer:
             self._heard_s = time.monotonic()
         elif (time_s := self._time_of(packet)) is None:
             self._counted["unknown"] += 1
+        elif isinstance(packet.sample, HandSample):
+            self._heard_s = max(packet.arrived_s, time.monotonic())
+            if self.clocks.leader is not None:
+                self._hands.take(packet.sample, time_s)
+                self._give_fingers()
         else:
             self._hear(packet, time_s)
             self._pass_on(packet, _timed(packet.sample, time_s), time_s)
@@ -251,10 +261,16 @@ class LiveWearer:
         placed = {} if head is None else {"R_head_device": head.R_joint_device, "t_head_device": head.t_joint_device}
         wearer = Wearer(setup.skeleton, R_wrist_imu=mounts, floor_m=setup.floor_m, **placed)
         self.session, self.skeleton, self.stage = self.opener.session(wearer), setup.skeleton, "live"
+        self._give_fingers()
         self._taken, self._taken_before = False, self._taken
         self._frames_before = self._counted["frames"]
         self._counted["sessions"] += 1
         self.fps = self.session.fps
+
+    def _give_fingers(self) -> None:
+        """A skeleton with fingers from the first tracked hand on; sinks begin anew with it."""
+        if self._hands and self.skeleton is not None and not has_fingers(self.skeleton):
+            self.skeleton = fingered(self.skeleton, {})
 
     def _seated(self, device: str, sample: Any) -> Any:
         """A device's sample as the session takes it, on the joint that wears it; None for a device that nobody wears."""
@@ -339,9 +355,12 @@ class LiveWearer:
             self.note(str(error))
             self._close()
             return None
-        if found is not None:
-            self._counted["frames"] += len(found)
-        return found
+        if found is None:
+            return None
+        self._counted["frames"] += len(found)
+        if self.skeleton is None or not has_fingers(self.skeleton):
+            return found
+        return posed(found, self.skeleton, self._hands.fitted(found.timestamps[0].item()))
 
     # --- the page's wishes ------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Hands that Aria's machine perception services (MPS) track, as poses of the skeleton's wrists.
+"""Hands that Aria's machine perception services (MPS) track, as poses of the skeleton's wrists, and their fingers.
 
 MPS gives places of a wrist and a palm's centre in its device frame `aria`, and normals of both, or 21 landmarks. In the
 sample's `hand_tracking_results_v2.csv` (projectaria_tools) the normals of both sides point out of the palm: as fingers curl,
@@ -14,11 +14,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from wearcap.body.hands import FINGER_NAMES, in_layout
+from wearcap.body.skeleton import SIDES
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.io.formats.poses import are_rotations, check_finite, check_rising, row_name
+from wearcap.recording.recording import FingerStream
 
 MIN_CONFIDENCE = 0.5
 """Least confidence of a hand, 0 … 1 (-1: not tracked). In the samples scores are beyond 0.9, and fall to this within half
@@ -27,6 +30,13 @@ a second where a hand is lost; below one half MPS itself finds it likelier that 
 _TIME = "tracking_timestamp_us"
 _WRIST, _INDEX, _PINKY, _PALM = (f"landmark_{k}" for k in (5, 8, 17, 20))
 """Landmarks of MPS: wrist, first joints of index finger and pinky, centre of the palm."""
+LANDMARKS = (
+    *(f"{finger}_tip" for finger in FINGER_NAMES),
+    *("wrist", "thumb_proximal", "thumb_distal"),
+    *(f"{finger}_{bone}" for finger in FINGER_NAMES[1:] for bone in ("proximal", "intermediate", "distal")),
+    "palm",
+)
+"""Joints of MPS' 21 landmarks, as its documentation lists them; there is none at the thumb's CMC joint."""
 
 
 def read_hands(files: Sequence[Path], head: Trajectory) -> tuple[dict[str, Trajectory], str]:
@@ -45,6 +55,29 @@ def read_hands(files: Sequence[Path], head: Trajectory) -> tuple[dict[str, Traje
             wrists = _wrists(path, head, landmarks, normals)
             return wrists, "" if wrists else f"{path.name} tracks no hand at a time of the head's path"
     return {}, f"{files[0].name} has no normals or landmarks: hands are left out" if files else ""
+
+
+def read_fingers(files: Sequence[Path]) -> dict[str, FingerStream]:
+    """Tracked hands by side, in the axes of the `aria` frame; of `files` the first with all landmarks counts, else none.
+
+    Raises WearcapError for missing columns, times that do not rise, and tracked rows with NaN.
+    """
+    names = {side: [f"t{axis}_{side}_landmark_{k}_device" for k in range(21) for axis in "xyz"] for side in SIDES}
+    path = next((path for path in files if set(names["left"]) <= set(read_header(path))), None)
+    if path is None:
+        return {}
+    scores = {side: f"{side}_tracking_confidence" for side in SIDES}
+    table = read_columns(path, [_TIME, *scores.values(), *names["left"], *names["right"]])
+    check_finite({name: table[name] for name in (_TIME, *scores.values())}, path)
+    check_rising(table[_TIME] * 1e-6, path)
+    hands, times = {}, torch.from_numpy(table[_TIME] * 1e-6)
+    for side in SIDES:
+        tracked, points = table[scores[side]] >= MIN_CONFIDENCE, np.stack([table[name] for name in names[side]], 1)
+        check_finite({f"{side} landmarks": points[tracked]}, path)
+        placed = in_layout(torch.from_numpy(points).float().unflatten(1, (-1, 3)), LANDMARKS)
+        sure = torch.from_numpy(table[scores[side]].clip(0, 1)).float()
+        hands[side] = FingerStream(times, placed, torch.from_numpy(tracked), sure)
+    return {side: hand for side, hand in hands.items() if hand.valid.any()}
 
 
 def _wrists(path: Path, head: Trajectory, landmarks: bool, normals: bool) -> dict[str, Trajectory]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.io.devices.aria_hands import read_hands
+from wearcap.io.devices.aria_hands import read_fingers, read_hands
 from wearcap.io.devices.axes import WORLDS
 from wearcap.io.formats.csv_table import iter_columns, read_columns, read_header
 from wearcap.io.formats.poses import check_finite, checked_trajectory
@@ -184,9 +184,16 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
         raise WearcapError(what, folder, "the output folder of Aria's MPS")
     track = read_closed_loop(path).trajectory
     head = head_stream(track, fps=fps, T_aria_cpf=T_aria_cpf, where=path)
-    wrists, note = read_hands(_found(folder, *_HANDS), track)
+    files = _found(folder, *_HANDS)
+    wrists, note = read_hands(files, track)
     name, points = Path(folder).resolve().name, read_mps_points(folder)
-    return Recording(name=name, head=head, points=points, tracked=wrists, source="Aria MPS", note=note)
+    first, last = track.timestamps[[0, -1]]
+    fingers = {
+        side: hand
+        for side, hand in read_fingers(files).items()
+        if (hand.valid & (hand.timestamps >= first) & (hand.timestamps <= last)).any()
+    }
+    return Recording(name, head, points=points, tracked=wrists, fingers=fingers, source="Aria MPS", note=note)
 
 
 def read_mps_points(folder: str | Path) -> PointCloud | None:

@@ -7,7 +7,7 @@ people look down, walk ahead and hold their hands ahead, and that eyes sit befor
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.conventions import AUTO, CHOICES, UNITS_M, Conventions
 from wearcap.io.devices.axes import CAMERA, OPENXR, UNITY, UNREAL
 from wearcap.io.devices.headset_tables import RawPoses
+from wearcap.recording.recording import FingerStream
 
 CONVENTIONS = {
     "unity": UNITY, "openxr": OPENXR, "steamvr": OPENXR, "unreal": UNREAL, "head": torch.eye(3), "camera": CAMERA
@@ -62,6 +63,10 @@ class HeadsetLog:
     """Whether the world's origin lies on the floor, as the head's height shows."""
     notes: tuple[str, ...]
     """What was detected or left out, a sentence each."""
+    unit_m: float = 1.0
+    """Metres per unit of the file."""
+    fingers: dict[str, FingerStream] = field(default_factory=dict)
+    """Hands by side, in the log's times."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +203,7 @@ def in_our_axes(poses: dict[str, RawPoses], how: Conventions, where: str, conven
     height = float(np.percentile(head.t_world_body[:, 2].numpy(), 90))
     floor = FLOOR_M[0] < height < FLOOR_M[1]
     origin = f"the origin is {'' if floor else 'not '}on the floor (the head is {height:.2f} m above it)"
-    return HeadsetLog(head, wrists, axes, floor, (*notes, *about_unit, origin))
+    return HeadsetLog(head, wrists, axes, floor, (*notes, *about_unit, origin), unit)
 
 
 def _matrices(raw: RawPoses, order: str) -> np.ndarray:

@@ -9,12 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from wearcap.body.hands import PALM
 from wearcap.boundary.opening import open_bytes
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, DETECTED, Conventions
-from wearcap.io.devices.headset_axes import PALM_M, HeadsetLog, in_our_axes
-from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, raw_poses
+from wearcap.io.devices.headset_axes import CONVENTIONS, PALM_M, HeadsetLog, in_our_axes
+from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, Fingers, raw_poses
 from wearcap.io.devices.headset_tables import (
     DeviceRows,
     PoseColumns,
@@ -26,6 +28,7 @@ from wearcap.io.devices.headset_tables import (
 )
 from wearcap.io.formats.bsor import is_bsor, read_bsor
 from wearcap.io.formats.times import UNITS
+from wearcap.recording.recording import FingerStream
 
 __all__ = ["PALM_M", "HeadsetLog", "is_headset_log", "is_headset_session", "read_headset_log"]
 _TABLES = {".csv", ".tsv", ".txt", ".json", ".jsonl"}
@@ -42,19 +45,24 @@ def read_headset_log(path: str | Path, how: Conventions = DETECTED, time_unit: s
     Trials of a session are one recording, with gaps between them. Raises WearcapError for a file without a headset's
     poses and times, numbers that are none, and where nothing in the log determines a convention.
     """
-    poses, convention, notes = read_raw_poses(Path(path), time_unit, how.axes)
+    poses, fingers, convention, notes = read_raw_poses(Path(path), time_unit, how.axes)
     log = in_our_axes(poses, how, str(path), convention)
     for angles, allowed in _AXES_OF_ANGLES.items():
         if angles in notes and log.axes not in allowed:
             fix = "Say which axes the log has (axes=unity|unreal|openxr), or log quaternions."
             raise WearcapError(f"{angles}, but axes {log.axes}", path, f"axes {', '.join(allowed)}", fix)
-    return replace(log, notes=(*notes, *log.notes))
+    hands = {}
+    for side, (seconds, places) in fingers.items():
+        points = (log.unit_m * torch.from_numpy(places) @ CONVENTIONS[log.axes].double().mT).float()
+        valid = points[:, PALM, :].isfinite().all(-1).all(-1)
+        hands[side] = FingerStream(torch.from_numpy(seconds), points, valid, valid.float())
+    return replace(log, fingers=hands, notes=(*notes, *log.notes))
 
 
 def read_raw_poses(
     path: Path, time_unit: str | None = None, axes: str = AUTO
-) -> tuple[dict[str, RawPoses], str | None, list[str]]:
-    """Poses of a log as they stand there, the axes that its format fixes, and notes. Raises as `read_headset_log` does."""
+) -> tuple[dict[str, RawPoses], Fingers, str | None, list[str]]:
+    """Poses and hands' joints of a log as they stand there, the axes that its format fixes, and notes. Raises as `read_headset_log` does."""
     if time_unit not in (None, *UNITS):
         raise WearcapError(f"time_unit={time_unit!r}", expected=f"one of {', '.join(UNITS)}")
     convention, notes = None, []
@@ -71,9 +79,9 @@ def read_raw_poses(
     else:
         rows = read_rows(path)
         convention = next((axes for words, axes in _AXES_OF_NAMES if words <= rows["head"].columns.words), None)
-    poses, mended = raw_poses(rows, time_unit, axes, path)
+    poses, fingers, mended = raw_poses(rows, time_unit, axes, path)
     usual = next((allowed[0] for angles, allowed in _AXES_OF_ANGLES.items() if angles in mended), None)
-    return poses, convention or usual, mended + notes
+    return poses, fingers, convention or usual, mended + notes
 
 
 def is_headset_log(path: str | Path) -> bool:

@@ -10,6 +10,8 @@ from wearcap.errors import WearcapError
 from wearcap.io.devices.headset_tables import DeviceRows, RawPoses, parts_of
 from wearcap.io.formats.times import check_span, evenly_spread, grain, in_order, in_seconds, without_repeats
 
+Fingers = dict[str, tuple[np.ndarray, np.ndarray]]
+"""By side, times (n,) s and places (n, joint, 3) of a hand's joints in the file's unit and axes."""
 _KINDS = {"wrist": {"wrist"}, "grip": {"grip"}}
 ARKIT = {"origin", "from", "anchor"}
 """Words of visionOS' anchors; those of hands have axes of their own."""
@@ -29,14 +31,16 @@ _TOLERANCE = 0.02, 0.1
 
 def raw_poses(
     rows: dict[str, DeviceRows], time_unit: str | None, axes: str, path: Path
-) -> tuple[dict[str, RawPoses], list[str]]:
-    """Poses of the devices over the time in which all of them are tracked, and notes of what was mended.
+) -> tuple[dict[str, RawPoses], Fingers, list[str]]:
+    """Poses of the devices over the time in which all of them are tracked, hands by side, and notes of what was mended.
 
     The stated `axes` decide what Euler angles mean: x, y, z are Unity's unless Unreal's are stated, and pitch, yaw, roll
     Unreal's unless Unity's are.
     Raises WearcapError for times that are none, for a head without two poses, and for rotations that are none.
     """
-    clock, poses = _clock(rows, time_unit, path), dict[str, RawPoses]()
+    hands = {joint[:-8]: (found, table.values) for joint, table in rows.items() if (found := table.columns.fingers)}
+    rows = {joint: table for joint, table in rows.items() if not table.columns.fingers}
+    clock, poses, fingers = _clock(rows, time_unit, path), dict[str, RawPoses](), Fingers()
     notes, shared = [f"times {_seconds(rows['head'], clock, time_unit, path)[1]} ({clock})"], None
     notes += _angles(rows, axes, path)
     for joint, table in sorted(rows.items()):  # the head first
@@ -60,8 +64,13 @@ def raw_poses(
         poses[joint] = _of_rows(pose, seen)
         if len(poses["head"].seconds) < 2:
             raise WearcapError("no two tracked poses of the headset", path, "positions and rotations")
+        for side, (found, values) in hands.items() if joint == "head" else ():  # in the same file's rows
+            points = found.points(values)[kept]
+            shown = RawPoses(seconds, points[:, 0], np.nan_to_num(points), None, None)
+            points[_frozen(shown, poses["head"])] = np.nan
+            fingers[side] = seconds, points
     check_span(poses["head"].seconds, path, lambda row: f"pose {row + 1} of the head")
-    return _together(poses, notes), notes
+    return _together(poses, notes), fingers, notes
 
 
 def _in_order(

@@ -19,11 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from wearcap.body.skeleton import WRISTS
+from wearcap.body.hands import OPENXR
+from wearcap.body.skeleton import SIDES, WRISTS
 from wearcap.boundary.limits import LIMITS
 from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import numbered_lines, parse_json, read_json
 from wearcap.errors import WearcapError
+from wearcap.io.devices.headset_fingers import FingerColumns, finger_columns
 from wearcap.io.formats.times import moment
 
 _DEVICES = {
@@ -89,6 +91,8 @@ class PoseColumns:
     """Of quaternions, where the names say it."""
     tracked: tuple[Any, ...] = ()
     """Places of flags that are false where the device is lost."""
+    fingers: FingerColumns | None = None
+    """Of a hand, whose "points" these are: no pose."""
 
 
 _Layout = tuple[dict[str, Any], Any, dict[str, PoseColumns]]
@@ -239,10 +243,9 @@ def _vector(text: str) -> list[str]:
 
 def _hololens_names(count: int) -> list[str]:
     """Names of the columns of head_hand_eye.csv, which has no header: times of Windows, and matrices by rows."""
-    names, joints = ["filetime", *(f"hololens_head_m_{k}" for k in range(16))], 26 * 16
-    for side in ("left", "right"):  # the second joint is the wrist
-        names.append(f"{side}_available")
-        names += [f"{side}_wrist_m_{k - 16}" if 16 <= k < 32 else "" for k in range(joints)]
+    names = ["filetime", *(f"hololens_head_m_{k}" for k in range(16))]
+    for side in SIDES:
+        names += [f"{side}_available", *(f"{side}_{joint}_m_{k}" for joint in OPENXR for k in range(16))]
     return names + [""] * (count - len(names))
 
 
@@ -288,7 +291,15 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
     if isinstance(value, list):
         if value and all(isinstance(item, dict) for item in value):
             words = (
-                (item, [str(word) for name, word in item.items() if name.lower() in _LABELS]) for item in value[:16]
+                (
+                    item,
+                    [
+                        str(word)
+                        for name, word in item.items()
+                        if name.lower() in _LABELS and not isinstance(word, dict)
+                    ],
+                )
+                for item in value[: len(OPENXR)]
             )
             value = {" ".join(named): item for item, named in words if named}
         else:
@@ -338,6 +349,11 @@ def _layout(names: dict[str, Any], begin: Sequence[Any], where: Path, device: st
         shown = ", ".join(list(names)[:8])
         expected = "time, head_pos_x … z, head_rot_x … w, and the same for left and right"
         raise WearcapError(f"{what} among the columns {shown}"[:300], where, expected)
+    if "head" in devices:
+        for side, found in finger_columns((parts_of(name), place) for name, place in names.items()).items():
+            wrist = devices.get(f"{side}_wrist")
+            tracked = () if wrist is None else wrist.tracked
+            devices[f"{side}_fingers"] = PoseColumns("points", found.places, frozenset(), None, tracked, found)
     return clocks, label, devices
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeletons import FINGER_JOINTS
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
@@ -36,7 +37,8 @@ _MATERIAL = {
     "pbrMetallicRoughness": {"baseColorFactor": [0.62, 0.68, 0.76, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7},
 }
 _THICK_M, _THIN_M = 0.022, 0.012
-"""Radii (m) of a stick at its start and its end."""
+_FINGER_M = 0.008
+"""Radii (m) of a stick at its start and its end, and of fingers' bones."""
 
 _GREY = np.full(3, 0.7, np.float32)
 
@@ -79,9 +81,9 @@ class SkinnedMesh:
         owners = np.array([joint for joint, _ in bones])
         start = skeleton.rest_joints.double().numpy()[owners]
         end = start + torch.stack([offset for _, offset in bones]).double().numpy()
-        mesh = capsules(
-            start, end, np.full(len(bones), _THICK_M), np.full(len(bones), _THIN_M), np.tile(_GREY, (len(bones), 1)), 8
-        )
+        slim = np.isin(np.array(skeleton.joint_names)[owners], FINGER_JOINTS)
+        radii = (np.where(slim, _FINGER_M, radius) for radius in (_THICK_M, _THIN_M))
+        mesh = capsules(start, end, *radii, np.tile(_GREY, (len(bones), 1)), 8)
         joints = np.zeros((len(mesh.vertices), 4), dtype=np.int64)
         joints[:, 0] = np.repeat(owners, len(mesh.vertices) // len(bones))
         weights = np.zeros((len(mesh.vertices), 4), dtype=np.float32)

@@ -104,6 +104,7 @@ def _check(motion: Motion, path: str | Path) -> None:
         "R_parent_joint": (motion.R_parent_joint, len(skeleton)),
         "hand_contact_prob": (motion.hand_contact_prob, len(HANDS)),
         "joint_std": (motion.joint_std, len(skeleton)),
+        "fingers_measured": (motion.fingers_measured, len(HANDS)),
         "interactions.hands": (None if interactions is None else interactions.hands, len(HANDS)),
     }
     for name, (value, size) in sizes.items():

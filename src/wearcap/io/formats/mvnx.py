@@ -1,7 +1,8 @@
 """Xsens MVNX: the suit's pose, foot contacts and sensors, as MVN exports them.
 
 MVN's segment frames are parallel to the world (x forward, y left, z up) in the T-pose, as those of `xsens23` are, and a
-segment's position is its joint's, so orientations are taken as they are.
+segment's position is its joint's, so orientations are taken as they are. Files of takes with gloves list the segments of each
+hand (`fingerTrackingSegmentsLeft`), "LeftSecondProximalPhalange" or "LeftSecondPP" for the index finger's first bone.
 """
 
 import io
@@ -17,14 +18,15 @@ from defusedxml.ElementTree import iterparse
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from wearcap.body.hands import FINGER_NAMES, HAND_JOINTS, in_layout
 from wearcap.body.kinematics import local_rotations
-from wearcap.body.skeleton import FOOT_PATCHES, Site, Skeleton, xsens23
+from wearcap.body.skeleton import FOOT_PATCHES, SIDES, Site, Skeleton, xsens23
 from wearcap.boundary.limits import LIMITS
 from wearcap.boundary.opening import open_bytes, understood
 from wearcap.boundary.texts import finite_floats, plain_xml, tag_of
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
-from wearcap.recording import ImuStream, Motion, Recording
+from wearcap.recording import FingerStream, ImuStream, Motion, Recording
 
 _LIMITS = LIMITS["mvnx"]
 _CHUNK = 1 << 16
@@ -54,12 +56,26 @@ SITE_OF = {"ptopofhead": "crown"} | {
 }
 """Anatomical points of the segments that are wearcap's sites."""
 
+_PHALANGES = {
+    "mc": "metacarpal", "metacarpal": "metacarpal", "pp": "proximal", "proximalphalange": "proximal",
+    "mp": "intermediate", "middlephalange": "intermediate", "dp": "distal", "distalphalange": "distal",
+}  # fmt: skip
+FINGER_OF = {"carpus": "wrist"} | {
+    number + segment: joint
+    for number, finger in zip(("first", "second", "third", "fourth", "fifth"), FINGER_NAMES)
+    for segment, bone in _PHALANGES.items()
+    if (joint := f"{finger}_{bone}") in HAND_JOINTS
+}
+"""A hand's segment, without its side, to the joint at its start."""
+
 _FIELDS = {
     "orientation": ("segments", 4),
     "position": ("segments", 3),
     "footContacts": ("contacts", 1),
     "sensorFreeAcceleration": ("sensors", 3),
     "sensorOrientation": ("sensors", 4),
+    **{f"orientationFingers{side.title()}": (side, 4) for side in SIDES},
+    **{f"positionFingers{side.title()}": (side, 3) for side in SIDES},
 }
 """Fields of each frame: the list of items that a field covers, and the number of values per item."""
 
@@ -78,6 +94,10 @@ class _File:
     """Label of an anatomical point: its segment, and its position in it (m)."""
     sensors: list[str] = field(default_factory=list)
     contacts: list[str] = field(default_factory=list)
+    fingers: dict[str, list[str]] = field(default_factory=lambda: {side: [] for side in SIDES})
+    """Segments of each hand."""
+    hand: str = ""
+    """Side of the hand whose segments are being read."""
     rest: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     """Fields of the identity and T-pose frames."""
     index: list[int] = field(default_factory=list)
@@ -93,7 +113,7 @@ class _File:
                 raise ValueError(f"a frame rate of {self.fps} Hz")
         elif name == "segment":
             label = plain_label(element.attrib["label"])
-            self.segments.append(label)
+            (self.fingers[self.hand] if self.hand else self.segments).append(label)
             for point in (child for child in element.iter() if tag_of(child) == "point"):
                 text = next((child.text or "" for child in point if tag_of(child) == "pos_b"), "")
                 self.points[plain_label(point.attrib["label"])] = (label, finite_floats(text.split()).tolist())
@@ -133,7 +153,8 @@ class _File:
     def numbers(self, name: str, text: str) -> np.ndarray:
         """The numbers of one of a frame's fields."""
         listing, width = _FIELDS[name]
-        count = width * (len(getattr(self, listing)) or len(FOOT_PATCHES) * (listing == "contacts"))
+        items = self.fingers[listing] if listing in self.fingers else getattr(self, listing)
+        count = width * (len(items) or len(FOOT_PATCHES) * (listing == "contacts"))
         if len(text) > 1000 + _MAX_NUMBER * count:
             raise ValueError(f"{name} with {len(text)} characters where {count} numbers belong")
         found = finite_floats(text.split())
@@ -167,7 +188,9 @@ def read_mvnx(path: str | Path) -> Recording:
             kept += event == "start"
             if kept > _LIMITS.items:
                 raise ValueError(f"more than {_LIMITS.items} elements beside its frames")
-            if event == "start" and name == "frames":
+            if name.startswith("fingerTrackingSegments"):
+                file.hand = name[22:].lower() if event == "start" and name[22:].lower() in SIDES else ""
+            elif event == "start" and name == "frames":
                 frames = element
             elif (event == "start" and name == "subject") or (
                 event == "end" and name in ("segment", "sensor", "contactDefinition", "frame")
@@ -242,7 +265,30 @@ def _recording(file: _File) -> Recording:
         for k, joint in known
     }
     name = file.path.name.split(".")[0]
-    return Recording(name, motion=motion, skeleton=skeleton, imu=imu, source="Xsens MVNX", note=note)
+    fingers = {side: hand for side in SIDES if (hand := _fingers(file, side, timestamps)) is not None}
+    return Recording(name, motion=motion, skeleton=skeleton, imu=imu, fingers=fingers, source="Xsens MVNX", note=note)
+
+
+def _fingers(file: _File, side: str, timestamps: Float64[Tensor, "time"]) -> FingerStream | None:
+    """A hand that a glove tracks; None without one."""
+    position, orientation = f"positionFingers{side.title()}", f"orientationFingers{side.title()}"
+    if not (file.frames[position] and file.frames[orientation]):
+        return None
+    joints = [FINGER_OF.get(label.removeprefix(side), "") for label in file.fingers[side]]
+    points, R = file.column(position, 3), matrix_from_quat_wxyz(_quaternions(file, orientation))
+    return glove_stream(timestamps, joints, points, R)
+
+
+def glove_stream(
+    timestamps: Float64[Tensor, "time"],
+    joints: list[str],
+    points: Float[Tensor, "time segment 3"],
+    R: Float[Tensor, "time segment 3 3"],
+) -> FingerStream:
+    """A tracked hand of a glove's segments, each by the joint at its start ("": none)."""
+    rotations = torch.stack([in_layout(column, joints) for column in R.float().unbind(-1)], -1)
+    valid = torch.ones(len(timestamps), dtype=torch.bool)
+    return FingerStream(timestamps, in_layout(points.float(), joints), valid, valid.float(), rotations)
 
 
 def _timestamps(file: _File) -> tuple[Float64[Tensor, "time"], str]:

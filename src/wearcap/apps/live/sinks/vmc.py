@@ -1,7 +1,8 @@
 """The body, and objects, to Unity, Unreal, Blender, VSeeFace and others by the VMC protocol (OSC over UDP, port 39539).
 
-A receiver gets `/VMC/Ext/Root/Pos` and a `/VMC/Ext/Bone/Pos` for each of Unity's humanoid bones: position and rotation
-relative to the parent bone, in Unity's axes (left-handed, x right, y up, z forward, metres), of a T-pose without rotations.
+A receiver gets `/VMC/Ext/Root/Pos` and a `/VMC/Ext/Bone/Pos` for each of Unity's humanoid bones (fingers' where they are captured):
+position and rotation relative to the parent bone, in Unity's axes (left-handed, x right, y up, z forward, metres), of a T-pose
+without rotations.
 Objects are trackers: a `/VMC/Ext/Tra/Pos` with the object's name, position and rotation (x y z w) in the world, for each
 that has a pose in the frame. Their own axes are turned like the world's: a mesh's x forward, y left, z up are Unity's z, -x, y.
 """
@@ -20,6 +21,7 @@ from wearcap.apps.live.pacing import Pacing
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sinks.objects import objects_of
 from wearcap.apps.live.source import Address, Addressed
+from wearcap.body.hands import has_fingers
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -47,6 +49,14 @@ BONES = {
     **{f"{side}{bone}": f"{side.lower()}_{joint}" for side in ("Left", "Right") for bone, joint in _SIDES.items()},
 }
 """Unity's names of bones, parents first, with our joints; the lowest of the spine's joints has no bone of its own."""
+_UNITY_FINGERS = {"Thumb": "thumb", "Index": "index", "Middle": "middle", "Ring": "ring", "Little": "pinky"}
+FINGER_BONES = {
+    f"{side}{name}{bone}": f"{side.lower()}_{finger}{k}"
+    for side in ("Left", "Right")
+    for name, finger in _UNITY_FINGERS.items()
+    for k, bone in enumerate(("Proximal", "Intermediate", "Distal"), 1)
+}
+"""The same of fingers, for skeletons that have them."""
 PARENTS = {
     "Hips": None,
     "Spine": "Hips", "Chest": "Spine", "UpperChest": "Chest", "Neck": "UpperChest", "Head": "Neck",
@@ -55,6 +65,8 @@ PARENTS = {
         ("LowerLeg", "UpperLeg"), ("Foot", "LowerLeg"), ("Toes", "Foot"))},
     **{f"{side}Shoulder": "UpperChest" for side in ("Left", "Right")},
     **{f"{side}UpperLeg": "Hips" for side in ("Left", "Right")},
+    **{f"{side}{name}{bone}": f"{side}{parent.format(name)}" for side in ("Left", "Right") for name in _UNITY_FINGERS
+       for bone, parent in (("Proximal", "Hand"), ("Intermediate", "{}Proximal"), ("Distal", "{}Intermediate"))},
 }  # fmt: skip
 """Parent of each bone; None of the hips."""
 SMALL_S = 4096.0
@@ -123,9 +135,11 @@ class VmcSink(Sink, Addressed):
 
 
 def bones_of(motion: Motion) -> tuple[Float[Tensor, "time bone 3"], Float[Tensor, "time bone 4"]]:
-    """Position and rotation (xyzw) of each of `BONES` relative to its parent, the hips' in the world, in Unity's axes."""
-    names = list(BONES)
-    pose = motion.T_world_joint[:, motion.skeleton.indices(*BONES.values())]
+    """Position and rotation (xyzw) of each of the skeleton's bones relative to its parent, the hips' in the world, in
+    Unity's axes."""
+    bones = BONES | (FINGER_BONES if has_fingers(motion.skeleton) else {})
+    names = list(bones)
+    pose = motion.T_world_joint[:, motion.skeleton.indices(*bones.values())]
     R, t = UNITY.mT @ pose.R @ UNITY, pose.t @ UNITY
     parents = [names.index(PARENTS[name]) for name in names[1:]]
     t_local, R_local = t.clone(), R.clone()
@@ -142,7 +156,7 @@ def bundle(
     _add(built, "/VMC/Ext/OK", 1, _CALIBRATED, 0)
     _add(built, "/VMC/Ext/T", float(np.float32(time_s)))
     _add(built, "/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    for name, place, turn in zip(BONES, t.tolist(), xyzw.tolist()):
+    for name, place, turn in zip(BONES | FINGER_BONES, t.tolist(), xyzw.tolist()):
         _add(built, "/VMC/Ext/Bone/Pos", name, *place, *turn)
     for name, pose in trackers.items():
         turn = quat_wxyz_from_matrix((UNITY.mT @ pose.R @ UNITY).double()).roll(-1)

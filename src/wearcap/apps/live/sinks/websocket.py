@@ -164,6 +164,8 @@ def _frame(wearer: str, motion: Motion, k: int, objects: dict[str, SeenObject]) 
     }
     if motion.joint_std is not None:
         frame |= {"joint_std": [round(each, 4) for each in motion.joint_std[k].tolist()], "joint_dof": motion.joint_dof}
+    if motion.fingers_measured is not None:
+        frame["fingers_measured"] = [bool(each) for each in motion.fingers_measured[k].tolist()]
     if objects:
         frame["objects"] = {name: _row(seen) for name, seen in objects.items()}
     return json.dumps(frame)

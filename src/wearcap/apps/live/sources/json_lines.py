@@ -4,6 +4,8 @@
  "position": [x, y, z], "rotation_wxyz": [w, x, y, z] or "matrix": [[…], […], […]], "axes": "wearcap" | "unity" | …,
  "lost": true, "points": [[x, y, z], …], "floor" (the head's), "acceleration": [x, y, z] (a watch's, which has no
  position), "confidence" (a camera's)}
+{"device": "left_hand" | "right_hand", "wearer", "time", "clock", "axes", "joints": [[x, y, z], …], "confidence", "lost"}: the
+ fingers of a tracked hand, 26 joints of OpenXR, 25 of WebXR (without the palm) or 21 of MediaPipe, in their order
 {"object": NAME, "wearer", "time", "clock", "position", "rotation_wxyz" or "matrix", "axes"}: an observed pose of an object
 {"active_object": NAME or null, "wearer", "time", "clock"}: which object is the active one from that time on
 """
@@ -19,17 +21,27 @@ import numpy as np
 import torch
 from websockets.exceptions import ConnectionClosed
 
-from wearcap.apps.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet, Sample
+from wearcap.apps.live.packets import CAMERA, HANDS, HEAD, OBJECT, SUIT, Inbox, Packet, Sample
 from wearcap.apps.live.source import Address, Budget, DatagramSource, Fault, counted, require
 from wearcap.apps.live.sources.parts import AXES, BAD_NAME, Names, checked_pose, matrix_of
 from wearcap.apps.web.connections import DELIVERING, SPOKEN
 from wearcap.apps.web.guard import Guard
 from wearcap.apps.web.sockets import serve_sockets
+from wearcap.body.hands import HAND_JOINTS, MEDIAPIPE, OPENXR, in_layout
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.recording.recording import FingerStream
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, WRONG_TYPE, number_fault, time_fault, values_fault
-from wearcap.sensors.samples import ActiveObject, HeadSample, LocalizationSample, ObjectSample, WatchSample, WristSample
+from wearcap.sensors.samples import (
+    ActiveObject,
+    HandSample,
+    HeadSample,
+    LocalizationSample,
+    ObjectSample,
+    WatchSample,
+    WristSample,
+)
 
 MAX_LINES = 64
 """Objects of a message."""
@@ -68,8 +80,10 @@ class _Message(msgspec.Struct):
     floor: float | None = None
     acceleration: _Vector | None = None
     confidence: float = 1.0
+    joints: list[_Vector] | None = None
 
 
+_LAYOUTS = {len(names): names for names in (OPENXR, HAND_JOINTS, MEDIAPIPE)}
 _NAMES = ("device", "wearer", "clock", "object", "active_object")
 
 
@@ -145,17 +159,32 @@ def _sample(device: str, timestamp: float, message: _Message) -> Sample:
             require(number_fault(floor, MAX_POSITION_M))
         points = None if message.points is None else _points(message.points, message.axes)
         return HeadSample(timestamp, pose, points, floor_height=floor)
+    if device in HANDS and (message.joints is not None or message.lost):
+        return HandSample(HANDS[device], timestamp, _joints(message, timestamp))
     if message.lost:
         raise Fault(NO_POSE)
     if device == CAMERA:
-        require(number_fault(message.confidence, 1.0))
-        return LocalizationSample(timestamp, _pose(message), max(0.0, message.confidence))
+        return LocalizationSample(timestamp, _pose(message), _confidence(message))
     if message.acceleration is None:
         return WristSample(device, timestamp, _pose(message))
     R = checked_pose((0.0, 0.0, 0.0), _rotation(message), message.axes).R
     acc = torch.tensor(message.acceleration)
     require(values_fault(acc, (3,), MAX_ACC_M_S2))
     return WatchSample(timestamp, R, AXES[message.axes] @ acc, device)
+
+
+def _confidence(message: _Message) -> float:
+    require(number_fault(message.confidence, 1.0))
+    return max(0.0, message.confidence)
+
+
+def _joints(message: _Message, timestamp: float) -> FingerStream:
+    """A hand at one time."""
+    rows = message.joints or [(0.0, 0.0, 0.0)] * len(OPENXR)
+    require(None if len(rows) in _LAYOUTS else WRONG_TYPE)
+    points = in_layout(_points(rows, message.axes)[None], _LAYOUTS[len(rows)])
+    sure, time = torch.tensor([_confidence(message)]), torch.tensor([timestamp], dtype=torch.float64)
+    return FingerStream(time, points, torch.tensor([not message.lost]), sure)
 
 
 def _rotation(message: _Message) -> torch.Tensor:

@@ -21,17 +21,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.apps.live.packets import SUIT, Packet
-from wearcap.apps.live.source import Address, DatagramSource, Fault, require
+from wearcap.apps.live.packets import HANDS, SUIT, Packet
+from wearcap.apps.live.source import Address, DatagramSource, Fault, counted, require
 from wearcap.apps.live.sources.parts import UNIT_TOLERANCE
+from wearcap.body.hands import HAND_JOINTS
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import Site, Skeleton, xsens23
 from wearcap.errors import require_choice
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
-from wearcap.io.formats.mvnx import BONE_CHANGE_M, JOINT_OF, SITE_OF, bone_offsets, plain_label
+from wearcap.io.formats.mvnx import BONE_CHANGE_M, JOINT_OF, SITE_OF, bone_offsets, glove_stream, plain_label
 from wearcap.recording import Motion
 from wearcap.sensors.packets import MAX_POSITION_M, NOT_A_ROTATION, NOT_FINITE, OUT_OF_RANGE
-from wearcap.sensors.samples import SuitPiece
+from wearcap.sensors.samples import HandSample, SuitPiece
 
 SEGMENTS = tuple(
     JOINT_OF[name]
@@ -44,6 +45,10 @@ SEGMENTS = tuple(
     )
 )
 """Joints of the segments 1…23."""
+FINGER_SEGMENTS = ["wrist", *(name for name in HAND_JOINTS[1:] if not name.endswith("_tip"))]
+"""Joints of a hand's 20 segments (the SDK's `XsFingerAnimationSegment`: carpus, then each finger's from the thumb on). The left
+hand's follow those of body and props, the right hand's the left one's."""
+MAX_SEGMENTS = 128
 SCALE_WAIT_S = 1.0
 """How long a character's poses wait for its size; without it, the bones are those of a pose."""
 MAX_JOINED = 4
@@ -69,7 +74,7 @@ NOT_UPRIGHT = "size that is not z up"
 class _Sample:
     """What has arrived of one sample."""
 
-    poses: np.ndarray = field(default_factory=lambda: np.zeros(len(SEGMENTS), _POSE))
+    poses: np.ndarray = field(default_factory=lambda: np.zeros(MAX_SEGMENTS, _POSE))
     seen: set[int] = field(default_factory=set)
     """Segments that have arrived, from 0."""
     parts: set[int] = field(default_factory=set)
@@ -117,7 +122,7 @@ class MvnSource(DatagramSource):
 
     def packets(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[Packet]:
         require(NO_MVN if len(data) < _HEADER.size or data[:4] != b"MXTP" else None)
-        kind, counter, part, items, time_ms, number, *_ = _HEADER.unpack_from(data)
+        kind, counter, part, items, time_ms, number, _, props, fingers, *_ = _HEADER.unpack_from(data)
         require(None if kind in (b"MXTP02", b"MXTP13") else OTHER_TYPE)
         character = self._characters.setdefault(number, _Character(arrived_s))
         if kind == b"MXTP13":
@@ -126,6 +131,11 @@ class MvnSource(DatagramSource):
             motion = self._motion(character, sample.poses, time_ms / 1000, arrived_s)
             wearer = self.wearer if number == 0 else f"{self.wearer or 'character'} {number}"
             yield Packet(wearer, SUIT, self.name, time_ms / 1000, arrived_s, SuitPiece(motion))
+            for k, device in enumerate(HANDS if fingers == 2 * len(FINGER_SEGMENTS) else ()):
+                first = len(SEGMENTS) + props + k * len(FINGER_SEGMENTS)
+                with counted(refuse):  # a glove that fails takes no body with it
+                    hand = self._hand(sample, first, HANDS[device], time_ms / 1000)
+                    yield Packet(wearer, device, self.name, time_ms / 1000, arrived_s, hand)
 
     def _joined(self, character: _Character, counter: int, part: int, data: bytes, items: int) -> _Sample | None:
         """The sample that a datagram completes, if it does."""
@@ -133,7 +143,7 @@ class MvnSource(DatagramSource):
         require(REPEATED if counter == character.newest else None)
         sample = character.samples.setdefault(counter, _Sample())
         poses = np.frombuffer(data, _POSE, items, _HEADER.size)
-        body = poses[(poses["id"] >= 1) & (poses["id"] <= len(SEGMENTS))]
+        body = poses[(poses["id"] >= 1) & (poses["id"] <= MAX_SEGMENTS)]
         sample.poses[body["id"] - 1] = body
         sample.seen.update((body["id"] - 1).tolist())
         sample.parts.add(part & 0x7F)
@@ -145,20 +155,31 @@ class MvnSource(DatagramSource):
                 raise Fault(INCOMPLETE)
             return None
         del character.samples[counter]
-        require(INCOMPLETE if len(sample.seen) < len(SEGMENTS) else None)
+        require(None if sample.seen >= set(range(len(SEGMENTS))) else INCOMPLETE)
         character.newest = counter
         return sample
 
-    def _motion(self, character: _Character, poses: np.ndarray, time_s: float, arrived_s: float) -> Motion:
-        """One frame of motion."""
-        quat_wxyz = torch.from_numpy(poses["quat_wxyz"].astype(np.float32)).double()[self._order]
-        t_world = torch.from_numpy(poses["position"].astype(np.float32)).double()[self._order]
+    def _hand(self, sample: _Sample, first: int, side: str, time_s: float) -> HandSample:
+        """A glove's hand, whose segments begin at a number from 0. Raises Fault for one that is not whole."""
+        require(None if sample.seen >= set(range(first, first + len(FINGER_SEGMENTS))) else INCOMPLETE)
+        R_world, t_world = self._upright(sample.poses[first : first + len(FINGER_SEGMENTS)])
+        at = torch.tensor([time_s], dtype=torch.float64)
+        return HandSample(side, time_s, glove_stream(at, FINGER_SEGMENTS, t_world[None], R_world[None]))
+
+    def _upright(self, poses: np.ndarray) -> tuple[Float[Tensor, "segment 3 3"], Float[Tensor, "segment 3"]]:
+        """Rotations and positions of segments in a world with z up. Raises Fault for what is none."""
+        quat_wxyz = torch.from_numpy(poses["quat_wxyz"].astype(np.float32)).double()
+        t_world = torch.from_numpy(poses["position"].astype(np.float32)).double()
         require(None if quat_wxyz.isfinite().all() and t_world.isfinite().all() else NOT_FINITE)
         require(None if ((quat_wxyz.norm(dim=-1) - 1).abs() <= UNIT_TOLERANCE).all() else NOT_A_ROTATION)
         if self.up == "y":  # the segments' own axes are turned like the world's
             quat_wxyz = torch.cat([quat_wxyz[:, :1], quat_wxyz[:, 1:][:, _Y_UP]], -1)
             t_world = t_world[:, _Y_UP]
-        R_world = matrix_from_quat_wxyz(quat_wxyz)
+        return matrix_from_quat_wxyz(quat_wxyz), t_world
+
+    def _motion(self, character: _Character, poses: np.ndarray, time_s: float, arrived_s: float) -> Motion:
+        """One frame of motion."""
+        R_world, t_world = self._upright(poses[self._order])
         offsets = bone_offsets(self._xsens23, R_world, t_world)
         metres = _metres(offsets)
         t_root = t_world[0] * metres
