@@ -13,7 +13,7 @@ import numpy as np
 from wearcap.boundary.opening import open_bytes
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, DETECTED, Conventions
-from wearcap.io.devices.headset_axes import PALM_M, HeadsetLog, in_our_axes
+from wearcap.io.devices.headset_axes import HeadsetLog, in_our_axes
 from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, raw_poses
 from wearcap.io.devices.headset_tables import (
     DeviceRows,
@@ -27,7 +27,7 @@ from wearcap.io.devices.headset_tables import (
 from wearcap.io.formats.bsor import is_bsor, read_bsor
 from wearcap.io.formats.times import UNITS
 
-__all__ = ["PALM_M", "HeadsetLog", "is_headset_log", "is_headset_session", "read_headset_log"]
+__all__ = ["HeadsetLog", "is_headset_log", "is_headset_session", "read_headset_log"]
 _TABLES = {".csv", ".tsv", ".txt", ".json", ".jsonl"}
 _MOST_FILES = 2000
 _AXES_OF_NAMES = (({"hololens"}, "openxr"), ({"viewer", "orientation"}, "openxr"), (ARKIT, "openxr"))
