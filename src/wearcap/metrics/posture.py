@@ -26,7 +26,7 @@ def postures(
     """Which frames are of each of `POSTURES`, of a motion's joints (poses "time joint", m) over its floor (m)."""
 
     def middle(name: str) -> Tensor:
-        return sum(T_world_joint.t[:, skeleton.index(f"{side}_{name}")] for side in SIDES) / 2
+        return T_world_joint.t[:, skeleton.indices(*(f"{side}_{name}" for side in SIDES))].mean(1)
 
     def bend(side: str) -> Tensor:
         hip, knee, ankle = (T_world_joint.t[:, skeleton.index(f"{side}_{name}")] for name in ("hip", "knee", "ankle"))
