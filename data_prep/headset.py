@@ -32,7 +32,7 @@ def headset_tasks(
     # up)
     axes: str = AUTO,
     quaternion: str = AUTO,  # order where columns do not name it: xyzw, wxyz
-    # wrist: OpenXR's hand joint; a controller: grip (OpenXR's pose), pointer (forward along the arm)
+    # wrist, palm (hand joints); of a controller grip, aim (OpenXR's poses), touch, index, vive (the device's own)
     hands: str = AUTO,
     time_unit: str | None = None,  # s, ms, us, ns; null: from the numbers
     # headset on the head joint: [x,y,z] or [x,y,z,qw,qx,qy,qz]; null: [0.09,0,0.075]

@@ -13,7 +13,7 @@ from wearcap.boundary.opening import placed, understood
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO, Conventions
-from wearcap.io.formats.c3d import read_markers
+from wearcap.io.formats.c3d_markers import read_markers
 from wearcap.io.formats.trc import Markers
 from wearcap.optimize.markers import MarkerBody, fit_body, fit_motion, fit_notes, rms_m
 from wearcap.recording.recording import Recording

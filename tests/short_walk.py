@@ -138,17 +138,16 @@ _HAND_JOINT = {
     "right": np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]),
 }
 """Columns: the hand joint's x, y (out of the back) and z (to the elbow) in a wrist's own axes, whose T-pose faces x."""
-_GRIP = {
-    "left": np.array([[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]]),
-    "right": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
-}
-"""Columns: a grip's x (out of the left palm and of the right hand's back), y (to the arm), z (from the thumb), as the
-specifications of OpenXR and WebXR have them."""
-_POINTER = {
+_AIM = {
     "left": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]),
     "right": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
 }
-"""Columns: x (as a grip's), y (on the thumb's side), z (to the elbow) of a controller that points along the arm."""
+"""Columns: x (out of the left palm and of the right hand's back), y (on the thumb's side), z (to the elbow) of a controller
+that points along the arm."""
+_GRIP = {side: R @ Rotation.from_euler("x", 60, degrees=True).as_matrix() for side, R in _AIM.items()}
+"""A grip looks along the tube in the fist, which is turned up by 60 degrees against it."""
+_ORIGIN_M = {"wrist": 0.0, "grip": 0.08, "aim": 0.12}
+"""Along the hand from the wrist."""
 
 
 def wrists(time, R, t) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -167,13 +166,13 @@ def wrists(time, R, t) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def headset_poses(time, R, t, convention: str, kind: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Matrices and places of head, left and right in a convention; hands as OpenXR's wrist joints, grips or pointers."""
-    axes = {"head": _DEVICE} | {"wrist": _HAND_JOINT, "grip": _GRIP, "pointer": _POINTER}[kind]
+    """Matrices and places of head, left and right in a convention; hands as OpenXR's wrist joints, grips or aims."""
+    axes = {"head": _DEVICE} | {"wrist": _HAND_JOINT, "grip": _GRIP, "aim": _AIM}[kind]
     bodies = {"head": (R, t)} | wrists(time, R, t)
     found = {}
     for name, (R_body, t_body) in bodies.items():
-        if kind != "wrist" and name != "head":
-            t_body = t_body + 0.08 * (1.0 if name == "left" else -1.0) * R_body[:, :, 1]
+        if name != "head":
+            t_body = t_body + _ORIGIN_M[kind] * (1.0 if name == "left" else -1.0) * R_body[:, :, 1]
         R_xr, t_xr = _TO_OPENXR @ R_body @ axes[name], t_body @ _TO_OPENXR.T
         flip = np.diag([1.0, 1.0, -1.0 if convention == "unity" else 1.0])
         found[name] = flip @ R_xr @ flip, t_xr @ flip

@@ -13,7 +13,7 @@ from command_line import exit_code
 from marker_person import markers_of, person, squats
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import Conventions
-from wearcap.io.formats.c3d import read_c3d, read_markers
+from wearcap.io.formats.c3d_markers import read_c3d, read_markers
 from wearcap.io.formats.trc import Markers
 from wearcap.metrics.gait import knee_deg
 

@@ -57,7 +57,7 @@ def written(time, poses, convention: str, order: str, unit: str, named: bool = F
     M, found = TO_OURS[convention], {}
     for joint, (R, t) in poses.items():
         quat = Rotation.from_matrix(M.T @ R @ M).as_quat()[:, ["xyzw".index(axis) for axis in order]]
-        found[joint] = RawPoses(time, t @ M * PER_UNIT[unit], quat, order if named else None, "grip")
+        found[joint] = RawPoses(time, t @ M * PER_UNIT[unit], quat, order if named else None, ("grip",))
     return found
 
 
@@ -99,7 +99,7 @@ def test_what_is_stated_wins():
     assert found.axes == "unity"
     assert np.abs(found.head.t_world_body.numpy() - poses["head"][1] * [-1, 1, 1]).max() < 1e-3
     for name, metres in (("foot", 0.3048), ("inch", 0.0254)):
-        other = {j: RawPoses(p.seconds, p.position / metres, p.rotation, p.order, p.kind) for j, p in raw.items()}
+        other = {j: RawPoses(p.seconds, p.position / metres, p.rotation, p.order, p.families) for j, p in raw.items()}
         with pytest.raises(WearcapError, match="no unit of length fits.*unit=m|cm|mm"):
             in_our_axes(other, Conventions(), "log")
         assert_is(in_our_axes(other, Conventions(unit=name), "log"), poses, "openxr")

@@ -54,7 +54,7 @@ def compare(found, time, R, t) -> None:
 
 
 @pytest.mark.parametrize("convention", ["unity", "openxr", "steamvr"])
-@pytest.mark.parametrize("kind", ["wrist", "grip", "pointer"])
+@pytest.mark.parametrize("kind", ["wrist", "grip", "aim"])
 @pytest.mark.parametrize("given", [True, False])
 def test_conventions_are_detected_or_given(tmp_path, convention, kind, given):
     time, R, t = short_walk.walk()
@@ -68,8 +68,7 @@ def test_conventions_are_detected_or_given(tmp_path, convention, kind, given):
 
 
 @pytest.mark.parametrize(
-    ("names", "kind", "scale"),
-    [(SNAKE, "grip", 1.0), (WRIST, "wrist", 1e3), (CAMEL, "pointer", 1e3), (GLUED, "grip", 1.0)],
+    ("names", "kind", "scale"), [(SNAKE, "grip", 1.0), (WRIST, "wrist", 1e3), (CAMEL, "aim", 1e3), (GLUED, "grip", 1.0)]
 )
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])
 @pytest.mark.parametrize("between", [",", ";", "\t"])

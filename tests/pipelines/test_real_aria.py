@@ -115,7 +115,11 @@ def test_a_true_skeleton_rides_with_the_real_head(real_data):
     place = resample(track, cue.timestamps[inside]).T_world_body.inverse() @ cue.points[inside]
     assert place.std(0).max() < 1e-3
     assert place.mean(0)[0] < -0.1, "behind the pupils"
-    assert (place.mean(0) + head.t_head_device).norm() < 0.1, "the assumed seat is near"
+    off_cm = 100 * (-place.mean(0) - head.t_head_device)
+    print(
+        f"seat off by {off_cm[0]:.1f} cm ahead, {off_cm[1]:.1f} to the left, {off_cm[2]:.1f} up, as the glasses are tilted"
+    )
+    assert off_cm.norm() < 8, "the assumed seat is near"
     late = {
         name: type(cue)(cue.timestamps + 60, cue.joint, cue.points, cue.confidence)
         for name, cue in recording.cues.items()

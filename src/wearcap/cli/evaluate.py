@@ -27,11 +27,13 @@ from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.breakdown import (
     activity_table,
     by_activity,
+    by_posture,
     error_columns,
     extremes,
     main_errors,
     mostly_done,
     part_table,
+    posture_table,
     recording_table,
 )
 from wearcap.evaluation.datasets import (
@@ -105,7 +107,8 @@ def run(config: DictConfig) -> Scores:
     show(rich_table(f"{store.root.name}, {config.split} split", scores))
     _show_where(name, rows, scores, activities[name], scoring.activity_of)
     places = extremes(main_errors(rows))
-    write_scores(config.output, scores, about, _errors(activities), places)
+    of_postures = {method: by_posture(found)[0] for method, found in of_method.items()}
+    write_scores(config.output, scores, about, _errors(activities), places, of_postures)
     write_outcomes(Path(config.output).with_suffix(".csv"), outcomes)
     show(f"table: {config.output}")
     if config.sheets:
@@ -118,6 +121,9 @@ def run(config: DictConfig) -> Scores:
 def _show_where(name: str, rows: list[Row], scores: Scores, activities: Scores, activity_of: Mapping[str, str]) -> None:
     """Tables of errors by part of the body, and, of several recordings, by activity and of the worst to the best."""
     show(part_table("by part of the body", scores))
+    errors, shares = by_posture(rows)
+    if errors:
+        show(posture_table(f"{name} by posture (share of the frames)", errors, shares))
     recordings = {row.recording for row in rows}
     if len(recordings) > 1 and extremes(main_errors(rows)):
         counts = Counter(mostly_done(activity_of[recording]) for recording in recordings)

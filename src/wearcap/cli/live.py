@@ -31,6 +31,7 @@ from wearcap.cli.conf import compose, hydra_main, load_pipeline
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError, nearest, require_choice
 from wearcap.files import write_text
+from wearcap.io.devices.hand_seats import SEATS
 from wearcap.reading import read
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput
@@ -38,8 +39,8 @@ from wearcap.tracking.stature import with_stature
 
 MAX_MESSAGES = 20
 """Different messages of libraries that are shown."""
-HANDS = ("auto", "grip", "pointer", "wrist", "joint")
-"""What tracked hands are; those of streams are held controllers where nothing is stated."""
+HANDS = ("auto", *SEATS, "joint")
+"""What tracked hands are; the first seconds show it where nothing is stated."""
 
 
 def run(config: DictConfig) -> dict[str, Any]:
@@ -71,7 +72,7 @@ def run(config: DictConfig) -> dict[str, Any]:
     if (config.height is None or speed > 1) and not config.guided:
         setup = setup or of_replay
     # A recording has the wrists themselves.
-    hands = "joint" if "replay" in given else "grip" if config.hands == "auto" else config.hands
+    hands = "joint" if "replay" in given else config.hands
     sinks: list[Sink] = [sink_of(each, config.host, pace=speed <= 1) for each in _listed(config.to)]
     capture = LiveCapture(
         system,

@@ -1,4 +1,4 @@
-"""Where a method errs: by what was done, by part of the body, and in which recordings."""
+"""Where a method errs: by what was done, by posture, by part of the body, and in which recordings."""
 
 import math
 from collections import defaultdict
@@ -8,6 +8,7 @@ from rich.console import Group
 from rich.table import Table
 
 from wearcap.metrics.position import PARTS
+from wearcap.metrics.posture import POSTURES, PREFIX, SHARE
 from wearcap.metrics.table import RATIOS, TRUTH, Row, Scores, Summary, aggregate, rich_lines
 
 UNNAMED = "unnamed"
@@ -26,6 +27,22 @@ def by_activity(rows: Iterable[Row], activity_of: Mapping[str, str]) -> Scores:
     for row in rows:
         groups[mostly_done(activity_of[row.recording])].append(row)
     return {activity: aggregate(group) for activity, group in sorted(groups.items())}
+
+
+def by_posture(rows: Iterable[Row]) -> tuple[Scores, dict[str, float]]:
+    """Errors over the frames of each posture of the truth, and its share of all frames; of rows without any, nothing."""
+    rows = list(rows)
+    found, shares, total = {}, {}, sum(row.frames for row in rows)
+    for posture in POSTURES:
+        name, group = f"{PREFIX}{posture}_", []
+        for row in rows:
+            scores = {metric.removeprefix(name): v for metric, v in row.scores.items() if metric.startswith(name)}
+            if frames := round(scores.pop(SHARE, 0.0) * row.frames):
+                group.append(Row(row.recording, row.seed, frames, scores))
+        if group:
+            plain = posture.replace("_", " ")
+            found[plain], shares[plain] = aggregate(group), sum(row.frames for row in group) / total
+    return found, shares
 
 
 def extremes(errors: Mapping[str, float]) -> dict[str, str]:
@@ -74,6 +91,13 @@ def activity_table(title: str, activities: Scores, counts: Mapping[str, int]) ->
     main = next(iter(next(iter(activities.values()))))
     ranked = sorted(activities, key=lambda name: -activities[name][main].mean)
     return part_table(title, {f"{name} ({counts[name]})": activities[name] for name in ranked})
+
+
+def posture_table(title: str, errors: Scores, shares: Mapping[str, float]) -> Table | Group:
+    """Errors of one method by posture, the worst first, with the share of the frames that it has."""
+    main = next(iter(next(iter(errors.values()))))
+    ranked = sorted(errors, key=lambda name: -errors[name][main].mean)
+    return part_table(title, {f"{name} ({100 * shares[name]:.0f} %)": errors[name] for name in ranked})
 
 
 def recording_table(title: str, rows: Iterable[Row], activity_of: Mapping[str, str]) -> Table | Group:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields
 
 from wearcap.errors import WearcapError, require_choice
+from wearcap.io.devices.hand_seats import SEATS
 
 UNITS_M = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "foot": 0.3048}
 """Metres per unit of length, by name."""
@@ -11,11 +12,10 @@ CHOICES = {
     "up": ("x", "y", "z", "-x", "-y", "-z"),
     "axes": ("camera", "head", "openxr", "steamvr", "unity", "unreal"),
     "quaternion": ("xyzw", "wxyz"),
-    "hands": ("wrist", "grip", "pointer"),
+    "hands": tuple(SEATS),
     "time_unit": ("s", "ms", "us", "ns"),
 }
-"""What may be stated, beside numbers; of `hands`, wrist is OpenXR's hand joint, grip its grip pose, and
-pointer a controller whose forward axis points along the arm."""
+"""What may be stated, beside numbers."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from wearcap.files import write_text
 from wearcap.geometry.rigid import Rigid
 from wearcap.metrics import gait, physics, position
 from wearcap.metrics.certainty import certainty_scores
+from wearcap.metrics.posture import PREFIX, errors_by_posture, postures
 from wearcap.recording.motion import Motion
 
 MAX_DECIMALS = 6
@@ -115,6 +116,8 @@ def evaluate_motion(
         **{f"{TRUTH}{name}": value for name, value in plausible_true.items()},
     }
     found = {name: float(value) for name, value in scores.items()}
+    of_truth = postures(truth.skeleton, pose_true, floor, fps)
+    found |= errors_by_posture(truth.skeleton, of_truth, error, "cm")
     return found | both_walking(prediction, truth) | certainty_scores(prediction, truth)
 
 
@@ -162,8 +165,8 @@ def _span(motion: Motion) -> str:
 
 def aggregate(rows: list[Row]) -> dict[str, Summary]:
     """Mean over recordings within each seed, weighted by frames (`PER_RECORDING`: equally), then mean
-    and spread over seeds. Scores that are NaN or missing (no contact, no walking, too few frames) are ignored. Where there are both, `RATIOS` of
-    these means to the truth's are added.
+    and spread over seeds. Scores that are NaN or missing (no contact, no walking, too few frames) are ignored, as are those by
+    posture (`breakdown.by_posture`). Where there are both, `RATIOS` of these means to the truth's are added.
 
     Raises WearcapError unless every seed was scored on the same recordings, once each.
     """
@@ -176,7 +179,7 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
     if len(seen) != 1:
         raise WearcapError("the seeds were not scored on the same recordings" if seen else "nothing was scored")
     by_metric: dict[str, list[float]] = {}
-    for name in dict.fromkeys(name for row in rows for name in row.scores):
+    for name in dict.fromkeys(name for row in rows for name in row.scores if not name.startswith(PREFIX)):
         means = []
         for recordings in by_seed.values():
             scored = [(row.scores.get(name, math.nan), row.frames) for row in recordings.values()]
@@ -279,12 +282,14 @@ def write_scores(
     about: dict[str, str | int | float] | None = None,
     activities: Mapping[str, Scores] | None = None,
     recordings: Mapping[str, str] | None = None,
+    postures: Mapping[str, Scores] | None = None,
 ) -> None:
     """Write a table as JSON, atomically: {"about", "methods": {method: {metric: {mean, std, seeds}}}}; values that
-    are not finite become null. `activities`: the same by method and activity; `recordings`: names by place ("worst" …)."""
+    are not finite become null. `activities`, `postures`: the same by method and activity or posture; `recordings`: names by place ("worst" …)."""
     tree: dict[str, Any] = {"about": about or {}, "methods": _plain(methods)}
-    if activities:
-        tree["activities"] = {method: _plain(scores) for method, scores in activities.items()}
+    for name, parts in (("activities", activities), ("postures", postures)):
+        if parts:
+            tree[name] = {method: _plain(scores) for method, scores in parts.items()}
     if recordings:
         tree["recordings"] = dict(recordings)
     write_text(path, json.dumps(tree, indent=1, allow_nan=False) + "\n")

@@ -21,7 +21,7 @@ from wearcap.io.conventions import CHOICES, DETECTED, Conventions
 from wearcap.io.devices.aria_mps import is_mps_folder
 from wearcap.io.devices.headset_log import is_headset_session
 from wearcap.io.formats.amass import read_amass
-from wearcap.io.formats.c3d import read_markers
+from wearcap.io.formats.c3d_markers import read_markers
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply

@@ -25,7 +25,7 @@ from wearcap.boundary.texts import read_json_object, require_layout
 from wearcap.files import write_text
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE
-from wearcap.io.devices.headset_axes import palm_of, wrist_of_hand
+from wearcap.io.devices.hand_seats import palm_of, wrist_of_hand
 from wearcap.runtime.graphs import SkeletonEntry, skeleton_to_json
 
 MAX_SEATS, MAX_JOINTS, MAX_NOTES = 64, 256, 100
@@ -76,7 +76,7 @@ class Known:
     """Of everyone; None: the first minute finds it."""
     height_m: float | None = None
     hands: str = "grip"
-    """What hand poses are (`hand_seat`)."""
+    """What hand poses are (`hand_seat`), or "auto"."""
     guided: bool = False
     """Whether everyone begins with the guided first minute."""
     file: Path | None = None
@@ -108,7 +108,7 @@ def head_seat() -> Seat:
 
 
 def hand_seat(joint: str, kind: str) -> Seat:
-    """Nominal seat of what the hand holds: "grip" or "pointer" (a controller), "wrist" (OpenXR's hand joint), "joint" (ours)."""
+    """Nominal seat of what the hand holds, by family of `hand_seats.SEATS`; "joint" is the wrist joint itself."""
     if kind == "joint":
         return Seat(joint, torch.eye(3), torch.zeros(3))
     R_joint_hand = wrist_of_hand(torch.eye(3)[None], joint, kind)[0].mT.contiguous()

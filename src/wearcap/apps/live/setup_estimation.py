@@ -18,6 +18,8 @@ from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height, xsens23
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.conventions import AUTO
+from wearcap.io.devices.hand_seats import SEATS, most_likely_seat
 from wearcap.sensors import packets
 from wearcap.sensors.samples import HeadSample, SuitPiece, WatchSample, WristSample
 from wearcap.tracking.stature import UNKNOWN, height_over, source_of
@@ -61,7 +63,7 @@ class SetupEstimation:
     ):
         """`requires`: what the system needs ("head", wrists); `tracked`: whether wrists are poses rather than watches.
 
-        `hands` is what hand poses are ("grip", "wrist", "joint": `setup.hand_seat`), `skeleton` the one that is scaled, and
+        `hands` is what hand poses are (`setup.hand_seat`, or "auto": by how arms bend), `skeleton` the one that is scaled, and
         `setup` that of last time. Raises WearcapError for a height that is no person's.
         """
         self.requires, self.tracked, self.hands, self.guided = tuple(requires), tracked, hands, guided
@@ -222,7 +224,7 @@ class SetupEstimation:
                 self._seats[device] = replace(seat, yaw_rad=0.0)
 
     def _nominal(self, joint: str) -> Seat:
-        return hand_seat(joint, self.hands if self.tracked else "joint")
+        return hand_seat(joint, ("grip" if self.hands == AUTO else self.hands) if self.tracked else "joint")
 
     # --- by itself ------------------------------------------------------------------------------------------------
 
@@ -563,11 +565,24 @@ class SetupEstimation:
 
     # --- end ------------------------------------------------------------------------------------------------------
 
+    def _seat_hands(self) -> None:
+        """Seat what hands hold by how the arms were seen, but for devices that are known from last time."""
+        start_s, known = self._now_s - HOLD_S, {} if self.before is None else self.before.seats
+        head = self._seen[HEAD].between(start_s, self._now_s) if HEAD in self._seen else None
+        seats = {device: seat for device, seat in self._seats.items() if seat.joint in WRISTS and device not in known}
+        seen = {seat.joint: found for device, seat in seats.items() if (found := self._window(device, start_s))}
+        if head is not None and seen:
+            family, sure = most_likely_seat(Trajectory(*head), {joint: Trajectory(*one) for joint, one in seen.items()})
+            self._seats |= {device: hand_seat(seat.joint, family) for device, seat in seats.items()}
+            self.notes.append(f"Hands hold {SEATS[family].label}, {100 * sure:.0f} % sure by the arms (else: hands=…).")
+
     def _finish(self) -> None:
         """Write up what was found; required wrists without a device get the nominal seat under their own name."""
         for joint in self._missing:
             self._note(joint, "no device was seen.")
             self._seats[joint] = self._nominal(joint)
+        if self.tracked and self.hands == AUTO:
+            self._seat_hands()
         seats = {device: seat for device, seat in self._seats.items() if seat.joint in WRISTS}
         if HEAD in self.requires:
             seats[HEAD] = self._head

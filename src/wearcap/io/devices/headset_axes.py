@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.conventions import AUTO, CHOICES, UNITS_M, Conventions
 from wearcap.io.devices.axes import CAMERA, OPENXR, UNITY, UNREAL
+from wearcap.io.devices.hand_seats import SEATS, most_likely_seat, palm_of, wrist_of_hand
 from wearcap.io.devices.headset_tables import RawPoses
 from wearcap.recording.recording import FingerStream
 
@@ -29,11 +28,6 @@ CONVENTIONS = {
 turned on both sides: R = M R' Mᵀ, t = M t'."""
 DETECTED = ("openxr", "unity", "unreal", "head")
 """Conventions that are looked for; OpenXR's stands for SteamVR's."""
-PALM_M = 0.08
-"""Distance (m) of a held controller's origin, the palm's middle, from the wrist (nominal)."""
-POINTS = 0.3
-"""Least value of `points_along_arm` of a controller that points along the arm."""
-HELD = {"wrist": "the hand joint", "grip": "the controller (grip pose)", "pointer": "the controller (pointing pose)"}
 MARGIN = 2.5
 """Least difference (nats) from the second best reading."""
 FORMAT_NATS = 4.0
@@ -176,7 +170,7 @@ def in_our_axes(poses: dict[str, RawPoses], how: Conventions, where: str, conven
     What `how` states wins; `convention` is what the file's format fixes, which counts as `FORMAT_NATS` of evidence.
     Raises WearcapError, which names the candidates, where the evidence does not decide.
     """
-    kinds = {joint: raw.kind if how.hands == AUTO else how.hands for joint, raw in poses.items()}
+    families = {joint: raw.families if how.hands == AUTO else (how.hands,) for joint, raw in poses.items()}
     stated, orders = how.quaternion != AUTO, CHOICES["quaternion"]
     known = how.quaternion if stated else poses["head"].order
     if known or poses["head"].rotation.ndim == 3:
@@ -188,18 +182,22 @@ def in_our_axes(poses: dict[str, RawPoses], how: Conventions, where: str, conven
     else:
         names, expected = (DETECTED, convention) if how.axes == AUTO else ((how.axes,), None)
         keys = [(name, order) for name in names for order in orders]
-        readings = {(name, order): _wearer(poses, unit, turned[order], name, kinds) for name, order in keys}
+        readings = {(name, order): _wearer(poses, unit, turned[order], name, families) for name, order in keys}
         (axes, order), notes = _best(readings, expected, where)
     notes += [f"quaternions {known} as {'given' if stated else 'named'}"] if known else []
     tracks = {joint: _in_axes(raw, unit, turned[order][joint], axes) for joint, raw in poses.items()}
     head, wrists = tracks.pop("head"), {}
+    seats = {joint: families[joint] for joint in tracks}
+    for some in {some for some in seats.values() if len(some) > 1}:
+        alike = {joint: track for joint, track in tracks.items() if seats[joint] == some}
+        likely, sure = most_likely_seat(head, alike, some)
+        notes.append(f"controllers or hands are not named: {likely} by how arms bend, {100 * sure:.0f} % sure")
+        seats |= dict.fromkeys(alike, (likely,))
     for joint, track in tracks.items():
-        along = points_along_arm(head, track, joint)
-        kind = kinds[joint] or ("pointer" if along > POINTS else "grip")
-        R = wrist_of_hand(track.R_world_body, joint, kind)
-        wrists[joint] = Trajectory(track.timestamps, R, track.t_world_body - R @ palm_of(joint, kind))
-        shown = "" if kinds[joint] else f", which points along the arm by {along:.2f}"
-        notes.append(f"{joint} from {HELD[kind]}{shown}")
+        (family,) = seats[joint]
+        R = wrist_of_hand(track.R_world_body, joint, family)
+        wrists[joint] = Trajectory(track.timestamps, R, track.t_world_body - R @ palm_of(joint, family))
+        notes.append(f"{joint} from {SEATS[family].label}")
     height = float(np.percentile(head.t_world_body[:, 2].numpy(), 90))
     floor = FLOOR_M[0] < height < FLOOR_M[1]
     origin = f"the origin is {'' if floor else 'not '}on the floor (the head is {height:.2f} m above it)"
@@ -243,7 +241,11 @@ def _rows(head: RawPoses, raw: RawPoses) -> np.ndarray:
 
 
 def _wearer(
-    poses: dict[str, RawPoses], unit: float, turned: dict[str, np.ndarray], name: str, kinds: dict[str, str | None]
+    poses: dict[str, RawPoses],
+    unit: float,
+    turned: dict[str, np.ndarray],
+    name: str,
+    families: dict[str, tuple[str, ...]],
 ) -> Wearer:
     """A log read in a convention."""
     M, head, hands = CONVENTIONS[name].double().numpy(), poses["head"], {}
@@ -256,7 +258,7 @@ def _wearer(
     for joint in (joint for joint in poses if joint != "head"):
         rows = (_rows(head, poses[joint])[::thin] // thin).clip(max=len(seconds) - 1)
         place = unit * poses[joint].position[::thin] @ M.T - neck[rows]
-        fingers = (M @ turned[joint][::thin] @ M.T)[:, :, 0] if kinds[joint] == "wrist" else None
+        fingers = (M @ turned[joint][::thin] @ M.T)[:, :, 0] if families[joint] == ("wrist",) else None
         seen = [None if x is None else np.einsum("nij,ni->nj", frame[rows], x) for x in (place, fingers)]
         hands[joint] = seen[0], seen[1]
     step = float(np.median(np.diff(seconds)))
@@ -298,40 +300,3 @@ def _in_axes(raw: RawPoses, unit: float, R: np.ndarray, name: str) -> Trajectory
     M = CONVENTIONS[name].double().numpy()
     turned, t = (torch.tensor(x, dtype=torch.float32) for x in (M @ R @ M.T, unit * raw.position @ M.T))
     return Trajectory(torch.tensor(raw.seconds), turned, t)
-
-
-def points_along_arm(head: Trajectory, hand: Trajectory, joint: str) -> float:
-    """How much more a hand's forward axis points along the arm (from about the shoulder) than its lower side does, which a
-    grip's does: the sum of mean cosines of its forward and its up axis."""
-    near = torch.searchsorted(head.timestamps, hand.timestamps).clamp(max=len(head) - 1)
-    R_yaw = rotation.about_axis("z", rotation.yaw_of(head.R_world_body[near]))
-    shoulder = head.t_world_body[near] + R_yaw @ hand.t_world_body.new_tensor([-0.1, 0.18 * _side(joint), -0.25])
-    arm = torch.nn.functional.normalize(hand.t_world_body - shoulder, dim=-1)
-    return ((hand.R_world_body[:, :, 0] + hand.R_world_body[:, :, 2]) * arm).sum(-1).mean().item()
-
-
-def wrist_of_hand(R_world_hand: Float[Tensor, "time 3 3"], joint: str, kind: str) -> Float[Tensor, "time 3 3"]:
-    """Rotation of a wrist joint from a hand pose in wearcap's axes (x forward, y left, z up of the device).
-
-    "wrist" is OpenXR's hand joint: forward along the fingers, up out of the hand's back. "grip" is OpenXR's grip pose:
-    forward along the fist from little finger to thumb, x right into the right palm and out of the left one, up to the
-    arm. "pointer" is a controller's own axes in many logs: forward along the arm, up on the thumb's side. A wrist joint's
-    own axes are the world's in a T-pose that faces x, palms down.
-    """
-    side = _side(joint)
-    forward, up = {
-        "wrist": ([0.0, side, 0.0], [0.0, 0.0, 1.0]),
-        "grip": ([1.0, 0.0, 0.0], [0.0, -side, 0.0]),
-        "pointer": ([0.0, side, 0.0], [1.0, 0.0, 0.0]),
-    }[kind]
-    x, z = R_world_hand.new_tensor(forward), R_world_hand.new_tensor(up)
-    return R_world_hand @ torch.stack([x, torch.linalg.cross(z, x), z])
-
-
-def palm_of(joint: str, kind: str) -> Float[Tensor, "3"]:
-    """Place (m) of a hand pose in the wrist joint's axes: the palm's middle, but for a hand joint."""
-    return torch.tensor([0.0, 0.0 if kind == "wrist" else PALM_M * _side(joint), 0.0])
-
-
-def _side(joint: str) -> float:
-    return 1.0 if joint.startswith("left") else -1.0

@@ -15,7 +15,7 @@ from wearcap.body.hands import PALM
 from wearcap.boundary.opening import open_bytes
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, DETECTED, Conventions
-from wearcap.io.devices.headset_axes import CONVENTIONS, PALM_M, HeadsetLog, in_our_axes
+from wearcap.io.devices.headset_axes import CONVENTIONS, HeadsetLog, in_our_axes
 from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, Fingers, raw_poses
 from wearcap.io.devices.headset_tables import (
     DeviceRows,
@@ -30,7 +30,7 @@ from wearcap.io.formats.bsor import is_bsor, read_bsor
 from wearcap.io.formats.times import UNITS
 from wearcap.recording.recording import FingerStream
 
-__all__ = ["PALM_M", "HeadsetLog", "is_headset_log", "is_headset_session", "read_headset_log"]
+__all__ = ["HeadsetLog", "is_headset_log", "is_headset_session", "read_headset_log"]
 _TABLES = {".csv", ".tsv", ".txt", ".json", ".jsonl"}
 _MOST_FILES = 2000
 _AXES_OF_NAMES = (({"hololens"}, "openxr"), ({"viewer", "orientation"}, "openxr"), (ARKIT, "openxr"))

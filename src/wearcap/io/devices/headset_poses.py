@@ -7,12 +7,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from wearcap.errors import WearcapError
+from wearcap.io.devices.hand_seats import families_named
 from wearcap.io.devices.headset_tables import DeviceRows, RawPoses, parts_of
 from wearcap.io.formats.times import check_span, evenly_spread, grain, in_order, in_seconds, without_repeats
 
 Fingers = dict[str, tuple[np.ndarray, np.ndarray]]
 """By side, times (n,) s and places (n, joint, 3) of a hand's joints in the file's unit and axes."""
-_KINDS = {"wrist": {"wrist"}, "grip": {"grip"}}
+
 ARKIT = {"origin", "from", "anchor"}
 """Words of visionOS' anchors; those of hands have axes of their own."""
 UNITY_ANGLES = "Euler angles in degrees, about z, x and y in turn as Unity's"
@@ -58,8 +59,8 @@ def raw_poses(
             seconds, kept = shared
         seen = seen[kept]
         _check_rotations(rotation[kept][seen], table.rows[kept][seen], f"{table.where} ", path)
-        kind = next((kind for kind, known in _KINDS.items() if table.columns.words & known), None)
-        pose = RawPoses(seconds, position[kept], rotation[kept], table.columns.order, kind)
+        families = families_named(table.columns.words)
+        pose = RawPoses(seconds, position[kept], rotation[kept], table.columns.order, families)
         notes += _tracked(pose, seen, joint, poses)
         poses[joint] = _of_rows(pose, seen)
         if len(poses["head"].seconds) < 2:

@@ -74,8 +74,8 @@ class RawPoses:
     """(n, 4) quaternions in the file's order, or (n, 3, 3) matrices in the file's axes (Euler angles are matrices)."""
     order: str | None
     """"xyzw" or "wxyz" where the file names it; None: not known, and for matrices."""
-    kind: str | None
-    """"wrist" or "grip" where names show it, else None."""
+    families: tuple[str, ...]
+    """What a hand's poses may be of by their names: families of `hand_seats.SEATS`."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from wearcap.metrics import objects as object_metrics
 from wearcap.metrics.detection import detection_scores
 from wearcap.metrics.physics import foot_contact, plausibility
 from wearcap.metrics.position import body_parts, joint_error_cm, mpjpe_cm, part_errors_cm
+from wearcap.metrics.posture import errors_by_posture, postures
 from wearcap.metrics.symmetry import closest_surface_error_cm
 from wearcap.metrics.table import TRUTH, Row, both_walking
 from wearcap.recording import Motion, Recording
@@ -132,6 +133,7 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     plausible_true = plausibility(truth.motion.skeleton, pose_true, touching, floor, fps)
     scores |= {f"{TRUTH}{name}": value.item() for name, value in plausible_true.items()}
     scores |= both_walking(motion, truth.motion)
+    scores |= errors_by_posture(skeleton, postures(skeleton, pose_true, floor, fps), error, "mm")
     busy = truth.active >= 0
     if busy.any():
         scores["busy_mpjpe_mm"] = 10 * mpjpe_cm(joints[busy], true[busy]).item()
