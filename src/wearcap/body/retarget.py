@@ -22,7 +22,7 @@ def _arc_lengths(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
     return torch.cat([steps.new_zeros(1), steps.cumsum(0)])
 
 
-def _carry(
+def carried_turns(
     turn: Float[Tensor, "*batch joint 3 3"], source: TPose, target: TPose, parents: tuple[int, ...]
 ) -> Float[Tensor, "*batch joint_t 3 3"]:
     """Turns of the target's joints, transferred from the source; joints without a counterpart follow their parent."""
@@ -81,7 +81,7 @@ def retarget(
     pose_s, pose_t = t_pose(source), t_pose(target)
     T_world_source = forward_kinematics(source, R_parent_joint, t_world_root)
     turn = T_world_source.R @ pose_s.R.to(T_world_source.R).transpose(-1, -2)
-    R_world = _carry(turn, pose_s, pose_t, target.parents) @ pose_t.R.to(turn)
+    R_world = carried_turns(turn, pose_s, pose_t, target.parents) @ pose_t.R.to(turn)
     hips = [pose_s.marks.limb[f"{side}_leg"][0] for side in SIDES]
     centre = T_world_source.t[..., hips, :].mean(-2)
     t_root = centre - (R_world[..., 0, :, :] @ pose_t.hip_centre.to(centre)[:, None])[..., 0]

@@ -38,6 +38,7 @@ from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.saving import on_skeleton, write_smplh
 from wearcap.metrics.gait import crouches
+from wearcap.prepare.rigs import read_rig, write_on_rig
 from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, dataset_folder
@@ -67,6 +68,7 @@ def captured(config: Any, system: System) -> Motion | None:
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     filmed_s = _filmed_s(config.video)
+    rig = None if config.to_rig is None else read_rig(config.to_rig)
     source = _input(config, system)
     recording = source.recording
     seeds = range(config.seed, config.seed + (config.samples if system.draws else 1))
@@ -83,6 +85,8 @@ def captured(config: Any, system: System) -> Motion | None:
         if recording.origin is not None:
             motion.provenance.update(origin=" ".join(map(str, recording.origin.tolist())))
         _write(motion, recording, folder, config)
+        if rig is not None:
+            write_on_rig(motion, rig, folder / f"motion_{rig.name}{rig.suffix}", config.keep_hands)
         if (knee_deg := crouches(motion)) is not None:
             show(
                 f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"

@@ -105,7 +105,7 @@ def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -
         raise WearcapError("timestamps repeat or fall", path, "rising timestamps")
     joints = len(motion.skeleton)
     shown = _SkinnedMesh.sticks(motion.skeleton) if body is None else _SkinnedMesh.of_body(body, motion.skeleton)
-    figure = _Figure(start_s=min(clock[0].item() for clock in clocks))
+    figure = Figure(start_s=min(clock[0].item() for clock in clocks))
     figure.add_joints(motion)
     figure.animate(motion.timestamps, dict(enumerate(motion.R_parent_joint.unbind(1), 1)), {1: motion.t_world_root})
     for name, track in tracks.items():
@@ -137,7 +137,7 @@ def _quat_xyzw(R: Float[Tensor, "element 3 3"]) -> Float32[np.ndarray, "element 
     return xyzw.astype(np.float32)
 
 
-class _Figure:
+class Figure:
     """The growing document: nodes, animation, and the binary chunk with the accessors that describe it."""
 
     def __init__(self, start_s: float):
@@ -210,8 +210,9 @@ class _Figure:
 
     def write(self, path: str | Path, document: dict[str, Any]) -> None:
         """GLB: a header and two chunks, each padded to four bytes (glTF 2.0 §4.4)."""
+        first, *others = document.get("buffers") or [{}]
         document |= {
-            "buffers": [{"byteLength": len(self.binary)}],
+            "buffers": [first | {"byteLength": len(self.binary)}, *others],
             "bufferViews": self.views,
             "accessors": self.accessors,
         }
