@@ -24,7 +24,7 @@ _BLEND_S = 0.07
 _AIRBORNE = 1e-3
 """Weight of a foot in the air, which counts where neither stands."""
 _SLACK_M = 0.005
-"""Distance from its place up to which a foot is left, for reaching bends nearly straight knees."""
+"""Height from its place up to which a foot is left: to shorten a nearly straight leg bends its knee by degrees."""
 _ROUGH_M = 0.04
 """Range of heights that count as one level."""
 _GAP_S = 0.15
@@ -118,8 +118,8 @@ def _on_feet(
     left = missing - moved[:, None]
     # A foot in the air need only stay above the floor, as far as the motion's does.
     lift = (left[..., 2:] - soles[..., None].clamp_min(0)).clamp_min(0)
-    left = torch.cat([share * left[..., :2], torch.lerp(lift, left[..., 2:], share)], -1)
-    left = left * (1 - _SLACK_M * scale / left.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp_min(0)
+    rise = torch.lerp(lift, left[..., 2:], share)
+    left = torch.cat([share * left[..., :2], rise - rise.clamp(-_SLACK_M * scale, _SLACK_M * scale)], -1)
     return moved, ankles + moved[:, None] + left
 
 

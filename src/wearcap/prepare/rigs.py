@@ -46,7 +46,10 @@ class Rig:
     R_parent_joint: Float[Tensor, "joint 3 3"]
     """Rotations that joints keep which are not driven, such as fingers'."""
     t_parent_joint: Float[Tensor, "joint 3"]
-    R_ours_file: Float[Tensor, "3 3"]
+    R_ours_bind: Float[Tensor, "3 3"]
+    """Turns the bind pose to our axes."""
+    R_world_file: Float[Tensor, "3 3"]
+    """Turns the file's axes to our world's; the same, but for a bind pose that is a frame and stands askew."""
     body: Skeleton
     """The driven joints by our names, with the bind pose as rest."""
     driven: tuple[int, ...]
@@ -106,16 +109,16 @@ def _rig(
     t, R_bind = take.rest, torch.eye(3, dtype=take.rest.dtype).repeat(len(take.rest), 1, 1)
     if isinstance(file, GlbRig):
         R_bind = file.R_bind
-    R_ours_file, odd = standing_rotation(t, found)
-    if R_ours_file is None and isinstance(file, BvhContent):
+    R_ours_bind, odd = standing_rotation(t, found)
+    if R_ours_bind is None and isinstance(file, BvhContent):
         frame = int(straightness(take.t, found).argmax())
         R_bind, t = take.R[frame], take.t[frame]
-        R_ours_file, _ = standing_rotation(t, found)
+        R_ours_bind, _ = standing_rotation(t, found)
         at = frame + len(file.R_parent_joint) - len(take.R)  # a first frame may have been left out
         still = file.R_parent_joint[at], file.t_parent_joint[at]
-    if R_ours_file is None:
+    if R_ours_bind is None:
         raise WearcapError(f"nobody stands in it: {odd}", path, "a bind pose with stretched limbs, T or A")
-    places = t @ R_ours_file.T
+    places = t @ R_ours_bind.T
     eye = torch.eye(3, dtype=places.dtype)
     tree = foreign_tree(path.name, take.parents, eye.repeat(1, len(places), 1, 1), places[None], found, eye)
     driven, _ = kept_joints(take.parents, found)
@@ -126,7 +129,7 @@ def _rig(
     height = (places[hips, 2] - places[ankles, 2]).mean().item()
     feet = [joint for joint in range(len(places)) if set(ankles) & set(ancestors(take.parents, joint))]
     bottom = places[feet, 2].min().item()
-    if lowest is not None and R_ours_file[2, 1] > 0.99 and 0 < bottom - lowest < _THICKEST * height:
+    if lowest is not None and R_ours_bind[2, 1] > 0.99 and 0 < bottom - lowest < _THICKEST * height:
         bottom = lowest
     over = places[ankles, 2].mean().item() - bottom
     return Rig(
@@ -135,13 +138,24 @@ def _rig(
         take.parents[: take.joints],
         R_bind[: take.joints],
         *still,
-        R_ours_file,
+        R_ours_bind,
+        _axes(R_ours_bind),
         tree.skeleton,
         tuple(driven),
         carrier,
         places[carrier] - places[driven[0]],
         over if over > _FLAT * height else 0.0,
     )
+
+
+def _axes(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """The rotation along the file's axes that is nearest to one, by its up and its forward axis."""
+    up = torch.zeros_like(R[2])
+    up[R[2].abs().argmax()] = R[2][R[2].abs().argmax()].sign()
+    level = R[0] * (1 - up.abs())
+    ahead = torch.zeros_like(up)
+    ahead[level.abs().argmax()] = level[level.abs().argmax()].sign()
+    return torch.stack([ahead, torch.linalg.cross(up, ahead), up])
 
 
 def write_on_rig(motion: Motion, rig: Rig, path: str | Path, keep_hands: bool = False) -> None:
@@ -155,8 +169,8 @@ def write_on_rig(motion: Motion, rig: Rig, path: str | Path, keep_hands: bool = 
     frames, fps = even_frames(motion)
     pose = (motion.R_parent_joint, motion.t_world_root)
     R, t = onto_character(motion.skeleton, pose, _stands(motion), fps, rig.body, rig.ankle_height, keep_hands)
-    t = (t + R[:, 0] @ rig.t_root_carrier) @ rig.R_ours_file
-    turn = rig.R_ours_file.T @ R @ rig.R_ours_file
+    t = (t + R[:, 0] @ rig.t_root_carrier) @ rig.R_world_file
+    turn = rig.R_world_file.T @ R @ rig.R_ours_bind
     world: list[Tensor] = []
     local: dict[int, Tensor] = {}
     at = {joint: k for k, joint in enumerate(rig.driven) if joint < len(rig.parents)} | {rig.carrier: 0}
