@@ -6,7 +6,6 @@ python blender_checks.py ADDON_FOLDER WHAT ARGUMENTS …
 import json
 import sys
 import time
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -70,33 +69,6 @@ def captured(command, recording, output, more, cancel_after):
     if found["done"]:
         found["bones"] = len(capture.import_motion(bpy.context, run.output / "motion.npz").pose.bones)
     return found
-
-
-def pictured(path, out, frame):
-    """The bones as sticks, rendered by Cycles on the CPU."""
-    scene = bpy.context.scene
-    made = capture.import_motion(bpy.context, path)
-    scene.frame_set(int(frame))
-    shown = made.evaluated_get(bpy.context.evaluated_depsgraph_get())
-    for bone in shown.pose.bones:
-        curve = bpy.data.curves.new(bone.name, "CURVE")
-        curve.dimensions, curve.bevel_depth = "3D", 0.025
-        line = curve.splines.new("POLY")
-        line.points.add(1)
-        for point, place in zip(line.points, (bone.head, bone.tail)):
-            point.co = (*place, 1)
-        scene.collection.objects.link(bpy.data.objects.new(bone.name, curve))
-    middle = shown.pose.bones["pelvis"].head
-    bpy.ops.mesh.primitive_plane_add(size=20)
-    bpy.ops.object.light_add(type="SUN", rotation=(0.6, 0.3, 0))
-    bpy.context.object.data.energy = 4
-    bpy.ops.object.camera_add(location=(middle.x + 2.5, middle.y - 2.5, 1.6), rotation=(1.35, 0, 0.785))
-    scene.camera = bpy.context.object
-    scene.render.engine, scene.cycles.samples, scene.cycles.device = "CYCLES", 4, "CPU"
-    scene.render.resolution_x = scene.render.resolution_y = 320
-    scene.render.filepath = out
-    bpy.ops.render.render(write_still=True)
-    return {"bytes": Path(out).stat().st_size}
 
 
 def refused(*paths):
