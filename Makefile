@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.wearcap-installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-real lint format lock clean
+.PHONY: help install demo test test-real lint format lock addon clean
 
 help:
 	@echo "make demo       prepare simulated data, train, evaluate, capture, export (about 2 minutes on 2 quiet cores)"
@@ -13,6 +13,7 @@ help:
 	@echo "make test-real  the tests on real recordings (../shared/data, or WEARCAP_REAL_DATA)"
 	@echo "make format     let ruff mend what it can"
 	@echo "make lock       write requirements.lock from a clean environment"
+	@echo "make addon      dist/wearcap_blender.zip, the Blender add-on"
 	@echo "make clean      remove $(VENV)"
 	@echo "PYTHON=python3.12 make demo  takes another interpreter (3.11 or 3.12)"
 
@@ -53,6 +54,10 @@ lock:
 	  | grep -v -E '^(nvidia-|triton|cuda-)' | sed 's/+cpu$$//' | sort -f; } > requirements.lock.new
 	mv requirements.lock.new requirements.lock
 	rm -rf $(VENV)-lock
+
+addon:
+	mkdir -p dist
+	$(PYTHON) -m zipfile -c dist/wearcap_blender.zip integrations/blender/wearcap_blender/*.*
 
 clean:
 	rm -rf $(VENV)

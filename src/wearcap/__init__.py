@@ -43,12 +43,18 @@ def source(path, height: float | None = None, scene=None, **stated):
     return CaptureInput.in_dataset(recording, dataset_folder(path), scene)
 
 
-def save(motion, path) -> None:
+def save(motion, path, rig=None, keep_hands: bool = False) -> None:
     """Write a `recording.Motion` as what the name's ending says: .npz, .bvh, .glb, .usd (.usda, .usdc, .usdz), .vrma (VRM
     animation), _smplh.npz (SMPL+H, as AMASS has it), .trc and .mot (OpenSim) or _angles.csv (joint angles, ISB).
 
-    Raises WearcapError for another ending, a missing extra, and when the file cannot be written.
+    `rig` is a character of your own, a .glb, .vrm or .bvh: its file is written with the motion on it, its proportions kept;
+    `keep_hands` then puts its wrists where the motion's are, instead of keeping the directions of the arms.
+    Raises WearcapError for another ending, a missing extra, a character that is not understood, and when the file cannot be written.
     """
     from wearcap.io.saving import save as save_motion
+    from wearcap.prepare.rigs import read_rig, write_on_rig
 
-    save_motion(motion, path)
+    if rig is None:
+        save_motion(motion, path)
+    else:
+        write_on_rig(motion, read_rig(rig), path, keep_hands)

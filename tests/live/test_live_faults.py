@@ -184,7 +184,7 @@ def test_wearers_who_come_and_leave_fill_no_memory_while_a_sink_stalls():
     thread.close()
 
 
-@pytest.mark.parametrize("scheme", ["vmc", "ws"])
+@pytest.mark.parametrize("scheme", ["vmc", "osctrackers", "ws"])
 def test_an_option_that_a_sink_does_not_have_is_refused(scheme):
     with pytest.raises(WearcapError, match="no option 'wearrer'.*wearer"):
         sink_of(f"{scheme}://127.0.0.1:39539?wearrer=anna", "127.0.0.1", True)
@@ -202,7 +202,7 @@ def test_what_a_stalled_sink_never_took_is_counted():
     assert stalled.sent + 5 * thread.dropped == 5 * 5
 
 
-@pytest.mark.parametrize("scheme", ["vmc", "ws"])
+@pytest.mark.parametrize("scheme", ["vmc", "osctrackers", "ws"])
 def test_a_host_without_a_possible_name_is_refused(scheme):
     sink = sink_of(f"{scheme}://a..b:9102", "127.0.0.1", True)
     with pytest.raises(WearcapError, match=r"a\.\.b"):

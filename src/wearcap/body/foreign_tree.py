@@ -140,7 +140,7 @@ def foreign_tree(
     `R_ours_rest` turns the file's bind pose to ours; None: frames are found from the motion.
     """
     roles = joint_roles(found)
-    kept, new_parents = _kept(parents, found)
+    kept, new_parents = kept_joints(parents, found)
     names = {joint: role for role, joint in roles.items()}
     if R_ours_rest is None:
         frames = _frames_in_motion(parents, positions, found, kept, new_parents)
@@ -161,7 +161,7 @@ def _mean(R: Float[Tensor, "time 3 3"], weight: Float[Tensor, "time"]) -> Float[
     return (R * weight[:, None, None]).sum(0) / weight.sum().clamp_min(1e-9)
 
 
-def _kept(parents: Sequence[int], found: BodyJoints) -> tuple[list[int], list[int]]:
+def kept_joints(parents: Sequence[int], found: BodyJoints) -> tuple[list[int], list[int]]:
     """The body's joints, the pelvis first and parents before children, and each one's parent among them.
 
     What hangs above the pelvis or beside the body (a root on the ground, fingers, eyes, props) is left out.

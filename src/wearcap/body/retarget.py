@@ -23,7 +23,7 @@ def _arc_lengths(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
     return torch.cat([steps.new_zeros(1), steps.cumsum(0)])
 
 
-def _carry(
+def carried_turns(
     turn: Float[Tensor, "*batch joint 3 3"], source: TPose, target: TPose, parents: tuple[int, ...]
 ) -> Float[Tensor, "*batch joint_t 3 3"]:
     """Turns of the target's joints, transferred from the source; joints without a counterpart follow their parent."""
@@ -82,7 +82,7 @@ def retarget(
     pose_s, pose_t = t_pose(source), t_pose(target)
     T_world_source = forward_kinematics(source, R_parent_joint, t_world_root)
     turn = T_world_source.R @ pose_s.R.to(T_world_source.R).transpose(-1, -2)
-    turns = _carry(turn, pose_s, pose_t, target.parents)
+    turns = carried_turns(turn, pose_s, pose_t, target.parents)
     shared = [name for name in FINGER_JOINTS if name in source and name in target]
     turns[..., target.indices(*shared), :, :] = turn[..., source.indices(*shared), :, :]
     R_world = turns @ pose_t.R.to(turn)

@@ -47,6 +47,7 @@ from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.saving import FORMATS, USD, on_skeleton, require_formats, save, usd_writer, write_smplh
 from wearcap.metrics.gait import crouches
 from wearcap.metrics.strides import gait_report
+from wearcap.prepare.rigs import read_rig, write_on_rig
 from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, dataset_folder
@@ -79,6 +80,7 @@ def captured(config: Any, system: System) -> Motion | None:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     filmed_s = _filmed_s(config.video)
     require_formats(config.formats)
+    rig = None if config.to_rig is None else read_rig(config.to_rig)
     source = _input(config, system)
     recording = source.recording
     seeds = range(config.seed, config.seed + config.samples)
@@ -98,6 +100,8 @@ def captured(config: Any, system: System) -> Motion | None:
         environment = None if motion.object_motion is None else system.objects(source)
         whole = with_fingers(motion, recording.fingers)  # of every system's motion, as far as the recording has hands
         _write(whole, source, environment, folder, config)
+        if rig is not None:
+            write_on_rig(motion, rig, folder / f"motion_{rig.name}{rig.suffix}", config.keep_hands)
         if (knee_deg := crouches(motion)) is not None:
             show(
                 f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"

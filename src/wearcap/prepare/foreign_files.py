@@ -12,7 +12,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.asf_amc import read_amc, read_asf
-from wearcap.io.formats.bvh import read_bvh_content
+from wearcap.io.formats.bvh import BvhContent, read_bvh_content
 from wearcap.io.formats.motion_npz import nominal_fps
 
 BALL_OF_FOOT = 0.69
@@ -76,14 +76,14 @@ def read_take(path: Path, amc_fps: float | int, asf: Path | None = None) -> Take
     kinds = [part for part in path.name.lower().split(".")[1:] if part in ("bvh", "amc")]
     if not kinds:
         raise WearcapError("no motion file", path, "a name that ends in .bvh or .amc, also with .xz or .gz")
-    take = _read_amc(path, asf or asf_beside(path), amc_fps) if kinds[-1] == "amc" else _read_bvh(path)
+    take = _read_amc(path, asf or asf_beside(path), amc_fps) if kinds[-1] == "amc" else bvh_take(read_bvh_content(path))
     if not (take.t.isfinite().all() and take.rest.isfinite().all()):
         raise WearcapError("joints lie at infinity", path, "finite offsets and positions")
     return take
 
 
-def _read_bvh(path: Path) -> Take:
-    content = read_bvh_content(path)
+def bvh_take(content: BvhContent) -> Take:
+    """A BVH file's joints and, behind them, its End Sites."""
     names, parents = list(content.names), list(content.parents)
     R, t, rest = content.R_parent_joint, content.t_parent_joint, content.t_rest.clone()
     for joint, end in enumerate(content.ends):

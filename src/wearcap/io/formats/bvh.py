@@ -7,6 +7,7 @@ values show.
 
 import math
 import re
+import warnings
 from array import array
 from collections import Counter
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
@@ -50,6 +52,8 @@ UNITS_M = {
 REACH_PER_HEIGHT = 1.46
 """Longest path along the bones (fingertip to toe tip) over body height; in the tested skeletons 1.46 … 1.53."""
 HEIGHT_M = (0.6, 2.6)
+_LOST_DEG = 0.5
+"""Largest turn about an axis without a channel that may be lost."""
 _R_FILE_WORLD = A.T.contiguous()
 """wearcap's axes in those of the files that are written."""
 
@@ -234,19 +238,31 @@ class BvhContent:
     step_s: float
     notes: tuple[str, ...] = ()
     """What was mended in it, in sentences."""
+    hierarchy: tuple[str, ...] = ()
+    """The lines above its numbers, up to MOTION."""
+    channels: tuple[tuple[tuple[str, str], ...], ...] = ()
+    """Of each joint: ("p" or "r", axis) in the file's order."""
+    shifted: tuple[int, ...] = ()
+    """Joints whose position channels are shifts from their OFFSETs."""
 
 
 def read_bvh_content(path: str | Path) -> BvhContent:
     """Read a .bvh file (plain, .gz or .xz) as it stands. Raises WearcapError naming file and line."""
     path = Path(path)
     mended: Counter[str] = Counter()
-    lines = _plain(numbered_lines(path), mended)
-    joints, motion_line = _Hierarchy.read(path, lines)
+    lines, hierarchy = _plain(numbered_lines(path), mended), list[str]()
+
+    def kept() -> Iterator[tuple[int, str]]:
+        for number, line in lines:
+            hierarchy.append(line.rstrip())
+            yield number, line
+
+    joints, motion_line = _Hierarchy.read(path, kept())
     step_s, values, notes = _parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
     t, R, shifts = _channels(joints, values)
     notes += [note.format(count) for note, count in mended.items()]
     if shifts:
-        notes.append(f"Position channels of {shifts} joints are read as shifts from their OFFSETs.")
+        notes.append(f"Position channels of {len(shifts)} joints are read as shifts from their OFFSETs.")
     ends = ((None if joint.end is None else (joint.end[0], joint.end[1], joint.end[2])) for joint in joints)
     return BvhContent(
         tuple(joint.name for joint in joints),
@@ -257,6 +273,9 @@ def read_bvh_content(path: str | Path) -> BvhContent:
         t,
         step_s,
         tuple(notes),
+        tuple(hierarchy),
+        tuple(tuple(joint.channels) for joint in joints),
+        tuple(shifts),
     )
 
 
@@ -277,8 +296,8 @@ def axes_rotation(path: Path, up: str, forward: str) -> Tensor:
 
 def _channels(
     joints: list[_Joint], values: np.ndarray
-) -> tuple[Float[Tensor, "time joint 3"], Float[Tensor, "time joint 3 3"], int]:
-    """Places in the parents' frames (file units), rotations, and the number of joints whose positions are shifts.
+) -> tuple[Float[Tensor, "time joint 3"], Float[Tensor, "time joint 3 3"], list[int]]:
+    """Places in the parents' frames (file units), rotations, and the joints whose positions are shifts.
 
     Some writers give children shifts from OFFSET, near zero, instead of the whole offset: they are added to it.
     """
@@ -302,7 +321,7 @@ def _channels(
         for axis in order:
             index = [starts[k] + joints[k].channels.index(("r", axis)) for k in members]
             R[:, members] = R[:, members] @ about_axis(axis, columns[:, index] * (math.pi / 180))
-    return t, R, int(shifted.sum())
+    return t, R, [joint for joint, shift in zip(children, shifted.tolist()) if shift]
 
 
 def _are_shifts(values: Float[Tensor, "time joint 3"], rest: Float[Tensor, "joint 3"]) -> Bool[Tensor, "joint"]:
@@ -360,6 +379,40 @@ def write_bvh(
     row = " ".join(["%.6f"] * table.shape[1])
     lines += ["MOTION", f"Frames: {len(table)}", f"Frame Time: {1 / fps:.9f}"]
     lines += [row % tuple(values) for values in table.tolist()]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_bvh_like(
+    like: BvhContent,
+    path: str | Path,
+    R_parent_joint: Float[Tensor, "time joint 3 3"],
+    t_parent_joint: Float[Tensor, "time joint 3"],
+    fps: float,
+) -> None:
+    """Write frames below the hierarchy of another file, in its unit, axes and order of channels.
+
+    Raises WearcapError for numbers that are not finite, and where a joint turns about an axis that it has no channel for.
+    """
+    if not (R_parent_joint.isfinite().all() and t_parent_joint.isfinite().all()):
+        raise WearcapError("the motion holds NaN or infinite values", path, "finite poses")
+    columns: list[np.ndarray] = []
+    for joint, channels in enumerate(like.channels):
+        axes = [axis for kind, axis in channels if kind == "r"]
+        order = "".join([*axes, *(axis for axis in "xyz" if axis not in axes)]).upper()
+        with warnings.catch_warnings():  # at gimbal lock the third angle is 0, and the rotation the same
+            warnings.simplefilter("ignore", UserWarning)
+            angles = Rotation.from_matrix(R_parent_joint[:, joint].double().numpy()).as_euler(order, degrees=True)
+        if np.abs(angles[:, len(axes) :]).max(initial=0.0) > _LOST_DEG:
+            what = (
+                f"joint {like.names[joint]!r} turns about more axes than it has channels ({' '.join(axes) or 'none'})"
+            )
+            raise WearcapError(what, path, "a rotation channel for each axis")
+        turned = dict(zip(axes, np.unwrap(angles, axis=0, period=360).T))
+        place = t_parent_joint[:, joint].double() - like.t_rest[joint] * (joint in like.shifted)
+        columns += [turned[axis] if kind == "r" else place[:, "xyz".index(axis)].numpy() for kind, axis in channels]
+    row = " ".join(["%.6f"] * len(columns))
+    lines = [*like.hierarchy, f"Frames: {len(R_parent_joint)}", f"Frame Time: {1 / fps:.9f}"]
+    lines += [row % tuple(values) for values in np.stack(columns, -1).tolist()]
     write_text(path, "\n".join(lines) + "\n")
 
 

@@ -6,6 +6,7 @@ shows the surfaces, makes an empty scene of many a damaged file.
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,23 +21,25 @@ from wearcap.io.formats.ply import GREY
 
 _TRIANGLES = 4
 _COMPONENTS = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
-_SHAPES = {"SCALAR": (), "VEC3": (3,), "VEC4": (4,)}
+_SHAPES = {"SCALAR": (), "VEC3": (3,), "VEC4": (4,), "MAT4": (16,)}
 
 
-class _View(msgspec.Struct):
+class View(msgspec.Struct):
     byteLength: int
     buffer: int = 0
     byteOffset: int = 0
     byteStride: int | None = None
 
 
-class _Accessor(msgspec.Struct):
-    bufferView: int
+class Accessor(msgspec.Struct):
     componentType: int
     count: int
     type: str
+    bufferView: int | None = None
     byteOffset: int = 0
     sparse: dict | None = None
+    min: list[float] = []
+    max: list[float] = []
 
 
 class _Primitive(msgspec.Struct):
@@ -49,7 +52,7 @@ class _Surface(msgspec.Struct):
     primitives: list[_Primitive]
 
 
-class _Node(msgspec.Struct):
+class Node(msgspec.Struct):
     mesh: int | None = None
     children: list[int] = []
     matrix: list[float] | None = None
@@ -67,16 +70,16 @@ class _Node(msgspec.Struct):
         return T
 
 
-class _Buffer(msgspec.Struct):
+class Buffer(msgspec.Struct):
     uri: str | None = None
 
 
 class _Gltf(msgspec.Struct):
     meshes: list[_Surface]
-    nodes: list[_Node]
-    accessors: list[_Accessor]
-    bufferViews: list[_View]
-    buffers: list[_Buffer]
+    nodes: list[Node]
+    accessors: list[Accessor]
+    bufferViews: list[View]
+    buffers: list[Buffer]
     extensionsRequired: list[str] = []
 
 
@@ -87,14 +90,12 @@ def read_glb(path: str | Path) -> Mesh:
     repeat more than its bytes explain.
     """
     data = read_bytes(path, "mesh")
-    with understood("not a readable glTF file", path, "a whole .glb file of triangles", errors=_DAMAGE):
-        magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
-        if (magic, version, length, kind) != (b"glTF", 2, len(data), b"JSON"):
-            raise ValueError("no header of glTF 2.0 binary")
-        tree = parse_json(data[20 : 20 + size], path, "mesh", schema=_Gltf)
+    with understood("not a readable glTF file", path, "a whole .glb file of triangles", errors=DAMAGE):
+        text, binary = glb_chunks(data)
+        tree = parse_json(text, path, "mesh", schema=_Gltf)
         if tree.extensionsRequired:
             raise ValueError(f"it needs {tree.extensionsRequired[0][:40]}")
-        parts = _Parts(tree, data[28 + size :], Budget(path, "mesh"))
+        parts = _Parts(tree, binary, Budget(path, "mesh"))
         parts.budget.spend(len(data))
         children = {child for node in tree.nodes for child in node.children}
         for root in set(range(len(tree.nodes))) - children:
@@ -102,7 +103,41 @@ def read_glb(path: str | Path) -> Mesh:
         return parts.mesh()
 
 
-_DAMAGE = (struct.error, LookupError, ValueError, TypeError, OverflowError, RecursionError, MemoryError)
+DAMAGE = (struct.error, LookupError, ValueError, TypeError, OverflowError, RecursionError, MemoryError)
+
+
+def glb_chunks(data: bytes) -> tuple[bytes, bytes]:
+    """The JSON of a .glb file, and its binary chunk with what follows it. Raises ValueError for another file."""
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    if (magic, version, length, kind) != (b"glTF", 2, len(data), b"JSON"):
+        raise ValueError("no header of glTF 2.0 binary")
+    return data[20 : 20 + size], data[28 + size :]
+
+
+def accessor_values(tree: Any, binary: bytes, number: int, *kinds: str) -> np.ndarray:
+    """An accessor's values, a view of the file's bytes; `tree` has `accessors`, `bufferViews` and `buffers`.
+
+    Raises ValueError or LookupError for values of other kinds, that lie elsewhere, and that are compressed.
+    """
+    accessor = tree.accessors[number]
+    if accessor.sparse or accessor.bufferView is None:
+        raise ValueError("values that are sparse, or elsewhere than in the file's own buffer")
+    view, dtype, shape = (
+        tree.bufferViews[accessor.bufferView],
+        _COMPONENTS[accessor.componentType],
+        _SHAPES[accessor.type],
+    )
+    row = dtype.itemsize * (shape[0] if shape else 1)
+    stride = view.byteStride or row
+    if view.buffer or tree.buffers[0].uri is not None:
+        raise ValueError("values that are sparse, or elsewhere than in the file's own buffer")
+    offset = view.byteOffset + accessor.byteOffset
+    stop = offset + (accessor.count - 1) * stride + row  # NumPy compares it with no buffer that is empty
+    inside = accessor.byteOffset >= 0 and view.byteOffset >= 0 and stop <= len(binary)
+    if accessor.type not in kinds or stride < row or accessor.count < 1 or not inside:
+        raise ValueError(f"an accessor of {accessor.count} {accessor.type}")
+    strides = (stride, dtype.itemsize)[: 1 + len(shape)]
+    return np.ndarray((accessor.count, *shape), dtype, binary, offset, strides)
 
 
 class _Parts:
@@ -150,24 +185,7 @@ class _Parts:
         self.count += len(vertices) + len(corners)
 
     def _array(self, number: int, *kinds: str) -> np.ndarray:
-        """An accessor's values, a view of the file's bytes."""
-        accessor = self.tree.accessors[number]
-        view, dtype, shape = (
-            self.tree.bufferViews[accessor.bufferView],
-            _COMPONENTS[accessor.componentType],
-            _SHAPES[accessor.type],
-        )
-        row = dtype.itemsize * (shape[0] if shape else 1)
-        stride = view.byteStride or row
-        if accessor.sparse or view.buffer or self.tree.buffers[0].uri is not None:
-            raise ValueError("values that are sparse, or elsewhere than in the file's own buffer")
-        offset = view.byteOffset + accessor.byteOffset
-        stop = offset + (accessor.count - 1) * stride + row  # NumPy compares it with no buffer that is empty
-        inside = accessor.byteOffset >= 0 and view.byteOffset >= 0 and stop <= len(self.binary)
-        if accessor.type not in kinds or stride < row or accessor.count < 1 or not inside:
-            raise ValueError(f"an accessor of {accessor.count} {accessor.type}")
-        strides = (stride, dtype.itemsize)[: 1 + len(shape)]
-        return np.ndarray((accessor.count, *shape), dtype, self.binary, offset, strides)
+        return accessor_values(self.tree, self.binary, number, *kinds)
 
     def mesh(self) -> Mesh:
         if not self.faces:

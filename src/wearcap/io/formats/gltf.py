@@ -231,8 +231,9 @@ class Figure:
 
     def write(self, path: str | Path, document: dict[str, Any]) -> None:
         """GLB: a header and two chunks, each padded to four bytes (glTF 2.0 §4.4)."""
+        first, *others = document.get("buffers") or [{}]
         document |= {
-            "buffers": [{"byteLength": len(self.binary)}],
+            "buffers": [first | {"byteLength": len(self.binary)}, *others],
             "bufferViews": self.views,
             "accessors": self.accessors,
         }

@@ -1,11 +1,16 @@
 """Sinks: where live motion goes, one protocol or kind of file a module."""
 
 from wearcap.apps.live.sink import Sink
+from wearcap.apps.live.sinks.osc_trackers import OscTrackerSink
 from wearcap.apps.live.sinks.vmc import VmcSink
 from wearcap.apps.live.sinks.websocket import WebSocketSink
 from wearcap.apps.live.source import addressed
 
-SINKS: dict[str, type[VmcSink | WebSocketSink]] = {"vmc": VmcSink, "ws": WebSocketSink}
+SINKS: dict[str, type[VmcSink | OscTrackerSink | WebSocketSink]] = {
+    "vmc": VmcSink,
+    "osctrackers": OscTrackerSink,
+    "ws": WebSocketSink,
+}
 """Sinks by the scheme of their addresses."""
 
 

@@ -7,23 +7,15 @@ Objects are trackers: a `/VMC/Ext/Tra/Pos` with the object's name, position and 
 that has a pose in the frame. Their own axes are turned like the world's: a mesh's x forward, y left, z up are Unity's z, -x, y.
 """
 
-import socket
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Float
-from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-from pythonosc.osc_message_builder import OscMessageBuilder
 from torch import Tensor
 
-from wearcap.apps.live.pacing import Pacing
-from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sinks.objects import objects_of
-from wearcap.apps.live.source import Address, Addressed
+from wearcap.apps.live.sinks.udp import Message, UdpSink, osc_bundle
 from wearcap.body.hands import has_fingers
-from wearcap.body.skeleton import Skeleton
-from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.io.devices.axes import UNITY
@@ -69,69 +61,22 @@ PARENTS = {
        for bone, parent in (("Proximal", "Hand"), ("Intermediate", "{}Proximal"), ("Distal", "{}Intermediate"))},
 }  # fmt: skip
 """Parent of each bone; None of the hips."""
-SMALL_S = 4096.0
-"""Times that begin beyond this count from the first frame: the protocol's single precision does not tell frames apart there."""
 _CALIBRATED = 3
 """Of `/VMC/Ext/OK`: the performer is calibrated."""
 
 
-class VmcSink(Sink, Addressed):
+class VmcSink(UdpSink):
     """Sends one wearer's body: the one that the address names (`?wearer=NAME`), else the first that comes."""
 
     port = 39539
     convention = "Unity's humanoid bones, objects as trackers; left-handed, y up, z forward, metres"
+    joints = tuple(BONES.values())
 
-    def __init__(self, address: Address, pace: bool = True):
-        """Raises WearcapError for options that the sink does not have."""
-        address.require_options()
-        self.address, self.name = address, f"vmc://{address.host}:{address.port}"
-        self.wearer = address.options.get("wearer")
-        self._pacing = Pacing(pace)
-        self._socket: socket.socket | None = None
-        self._step_s = 1 / 60
-        self._origin_s: float | None = None
-        """Device time (s) that `/VMC/Ext/T` counts from."""
-
-    def open(self) -> None:
-        where = f"{self.address.host}:{self.address.port}"
-        try:
-            family, kind, *_, target = socket.getaddrinfo(self.address.host, self.address.port, type=socket.SOCK_DGRAM)[
-                0
-            ]
-            self._socket = socket.socket(family, kind)
-        except (OSError, UnicodeError) as error:  # the latter of a host's name
-            raise WearcapError(f"cannot send to this address ({error})", where, "vmc://HOST:PORT") from error
-        self._socket.setblocking(False)
-        self._target = target
-
-    def begin(self, wearer: str, skeleton: Skeleton, fps: float) -> None:
-        if missing := next((joint for joint in BONES.values() if joint not in skeleton), None):
-            raise WearcapError(f"a skeleton without {missing!r}", self.name, "xsens23")
-        self.wearer = wearer if self.wearer is None else self.wearer
-        if wearer == self.wearer:
-            self._step_s, self._origin_s = 1 / fps, None
-
-    def take(self, wearer: str, motion: Motion) -> None:
-        if wearer != self.wearer:
-            return
-        if self._origin_s is None:
-            first_s = motion.timestamps[0].item()
-            self._origin_s = 0.0 if abs(first_s) < SMALL_S else first_s
+    def datagrams(self, motion: Motion, origin_s: float) -> Iterator[bytes]:
         (positions, rotations), objects = bones_of(motion), objects_of(motion)
         for k, time_s in enumerate(motion.timestamps.tolist()):
-            self._pacing.wait(self._step_s, self.waiting > 1)
             trackers = {name: seen.T_world_object for name, seen in objects[k].items()}
-            self._send(bundle(positions[k], rotations[k], time_s - self._origin_s, trackers))
-
-    def close(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-
-    def _send(self, data: bytes) -> None:
-        assert self._socket is not None
-        with suppress(BlockingIOError, ConnectionRefusedError):  # nobody listens yet, or the machine is busy
-            self._socket.sendto(data, self._target)
-            self.sent += 1
+            yield bundle(positions[k], rotations[k], time_s - origin_s, trackers)
 
 
 def bones_of(motion: Motion) -> tuple[Float[Tensor, "time bone 3"], Float[Tensor, "time bone 4"]]:
@@ -152,21 +97,14 @@ def bundle(
     t: Float[Tensor, "bone 3"], xyzw: Float[Tensor, "bone 4"], time_s: float, trackers: Mapping[str, Rigid]
 ) -> bytes:
     """One frame as an OSC bundle; `trackers`: poses by name in wearcap's world."""
-    built = OscBundleBuilder(IMMEDIATELY)  # pyright: ignore[reportArgumentType]
-    _add(built, "/VMC/Ext/OK", 1, _CALIBRATED, 0)
-    _add(built, "/VMC/Ext/T", float(np.float32(time_s)))
-    _add(built, "/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    messages: list[Message] = [
+        ("/VMC/Ext/OK", 1, _CALIBRATED, 0),
+        ("/VMC/Ext/T", float(np.float32(time_s))),
+        ("/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    ]
     for name, place, turn in zip(BONES | FINGER_BONES, t.tolist(), xyzw.tolist()):
-        _add(built, "/VMC/Ext/Bone/Pos", name, *place, *turn)
+        messages.append(("/VMC/Ext/Bone/Pos", name, *place, *turn))
     for name, pose in trackers.items():
         turn = quat_wxyz_from_matrix((UNITY.mT @ pose.R @ UNITY).double()).roll(-1)
-        _add(built, "/VMC/Ext/Tra/Pos", name, *(pose.t @ UNITY).tolist(), *turn.tolist())
-    return built.build().dgram
-
-
-def _add(built: OscBundleBuilder, address: str, *values: str | int | float) -> None:
-    message = OscMessageBuilder(address)
-    for value in values:
-        kind = {str: "s", int: "i", float: "f"}[type(value)]
-        message.add_arg(value, kind)
-    built.add_content(message.build())
+        messages.append(("/VMC/Ext/Tra/Pos", name, *(pose.t @ UNITY).tolist(), *turn.tolist()))
+    return osc_bundle(messages)
