@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 
+from data_prep.marker_fit import MARKERS, MarkerBody, fit_body, fit_motion, plug_in_gait
 from data_prep.shared.engine import NOTE, Splits, Task, source_folder
 from data_prep.shared.mocap import MOCAP, About, MocapSettings, mocap_recording
 from wearcap.boundary.opening import placed, understood
@@ -14,7 +15,6 @@ from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.formats.trc import Markers, read_trc
-from wearcap.optimize.markers import MARKERS, MarkerBody, fit_body, fit_motion, plug_in_gait
 from wearcap.recording.recording import Recording
 
 VERSION = 1

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from data_prep.marker_fit import _ROWS
 from wearcap.body.skeleton import Skeleton, skeleton_of_height
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.trc import Markers
-from wearcap.optimize.markers import _ROWS
 from wearcap.recording import Motion
 
 FPS = 100.0
