@@ -6,8 +6,8 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
+from data_prep.keypoint_detectors import MODEL_VARIABLE, Detector, MediaPipeHands, _Hand, wearers_hands
 from wearcap.errors import WearcapError
-from wearcap.localization.keypoints import MODEL_VARIABLE, Detector, MediaPipeHands, _Hand, wearers_hands
 
 
 def mark(x: float, y: float) -> SimpleNamespace:
