@@ -3,17 +3,49 @@
 This does not use the task engine: a failure must leave the recording in its data set, and a large encoder is loaded once.
 """
 
+import hashlib
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import groupby, islice
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from data_prep.pretrained_images import Clip, DinoV2
 from data_prep.shared.engine import Report, check_recording, registering
-from wearcap.data.embeddings import embed_camera, embedding_name
+from wearcap.boundary.tensors import read_tensors, write_tensors
+from wearcap.data.pictures import picture_files, pictures
 from wearcap.errors import WearcapError, require_choice
-from wearcap.files import remove_leftovers
+from wearcap.files import remove_leftovers, sha256_of
 from wearcap.locks import folder_lock
-from wearcap.models.image_encoder import Clip, DinoV2, EgoViewEncoder, ImageEncoder
+from wearcap.models.image_encoder import EgoViewEncoder
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import Entry, RecordingFile, RecordingStore, save_recording
+
+BATCH = 64
+_KEYS = ("embedding", "embedding_mirrored")
+
+
+@runtime_checkable
+class ImageEncoder(Protocol):
+    """The interface of an image encoder."""
+
+    name: str
+    size: int
+    """Length of an embedding."""
+
+    @property
+    def fingerprint(self) -> str:
+        """8 hex digits that differ between encoders with different embeddings of the same image."""
+        ...
+
+    def embed(self, frames: UInt8[Tensor, "batch height width 3"]) -> Float[Tensor, "batch feature"]:
+        """Embeddings of RGB images of any size, on the encoder's device."""
+        ...
 
 
 def embeddings_rework(
@@ -68,7 +100,7 @@ def embed_dataset(
                     ):
                         report.current.append(name)
                     else:
-                        made[name] = _embed(store, name, file, encoder, cache)
+                        made[name] = _embedded(store, name, file, encoder, cache)
                         report.written.append(name)
                 except WearcapError as error:
                     report.failed[name] = str(error)
@@ -79,7 +111,7 @@ def embed_dataset(
     return report
 
 
-def _embed(
+def _embedded(
     store: RecordingStore, name: str, file: RecordingFile, encoder: ImageEncoder, cache: str | Path | None
 ) -> Entry:
     recording, entry = file.load(), store.entries[name]
@@ -89,3 +121,53 @@ def _embed(
     check_recording(recording)
     save_recording(recording, store.path_of(name))
     return Entry.of(recording, store.root, entry.split, entry.config_hash)
+
+
+def embedding_name(encoder: ImageEncoder) -> str:
+    """Name of an encoder's embeddings in a camera stream: NAME-FINGERPRINT, as other weights give other embeddings."""
+    return f"{encoder.name}-{encoder.fingerprint}"
+
+
+def embed_camera(camera: CameraStream, folder: Path, encoder: ImageEncoder, cache: Path | None = None) -> CameraStream:
+    """The stream with `embedding`, `embedding_mirrored` (float16) and `embedding_name`.
+
+    `folder` is the data set's. Embeddings are kept in `cache` (default: `folder`/cache) below
+    `embeddings-<name>-<fingerprint>`, named by the content of the pictures' files. Raises WearcapError for a stream
+    without pictures, files that are missing or damaged, and another number of pictures than of timestamps.
+    """
+    files = picture_files(camera, folder)
+    name = embedding_name(encoder)
+    content = hashlib.sha256("".join(map(sha256_of, files)).encode()).hexdigest()
+    kept = (cache or folder / "cache") / f"embeddings-{name}" / f"{content[:32]}.safetensors"
+    embeddings = _read(kept, encoder.size)
+    if embeddings is None:
+        embeddings = _embed(pictures(camera, folder), encoder)
+        write_tensors(kept, embeddings)
+    count = len(embeddings["embedding"])
+    if count != len(camera.timestamps):
+        what = f"{count} pictures for {len(camera.timestamps)} timestamps"
+        fix = "The video was cut or belongs to another recording: prepare the data set again."
+        raise WearcapError(what, where=files[0], expected="a picture for each timestamp of the camera", fix=fix)
+    return replace(camera, **embeddings, embedding_name=name)
+
+
+def _read(path: Path, size: int) -> dict[str, Tensor] | None:
+    """Cached embeddings, or None if they are missing or incomplete."""
+    try:
+        _, tensors = read_tensors(path, "file of embeddings")
+    except WearcapError:
+        return None
+    whole = set(tensors) == set(_KEYS) and all(value.shape[1:] == (size,) for value in tensors.values())
+    return tensors if whole else None
+
+
+def _embed(
+    frames: Iterator[UInt8[np.ndarray, "height width 3"]], encoder: ImageEncoder
+) -> dict[str, Float[Tensor, "time feature"]]:
+    parts = []
+    for _, alike in groupby(frames, key=lambda frame: frame.shape):
+        while images := list(islice(alike, BATCH)):
+            batch = torch.from_numpy(np.stack(images))
+            parts.append(torch.stack([encoder.embed(batch), encoder.embed(batch.flip(2))]).half().cpu())
+    both = torch.cat(parts, 1) if parts else torch.zeros(2, 0, encoder.size).half()
+    return dict(zip(_KEYS, both.contiguous().unbind()))

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.keypoint_detectors import MediaPipeHands, RecordedDetections, find_model, read_keypoints
+from data_prep.keypoint_flow import FlowSettings, tracked_cues
 from data_prep.shared.engine import Report, Task, prepare
-from wearcap.data.embeddings import pictures
+from wearcap.data.pictures import pictures
 from wearcap.errors import WearcapError, require_choice
 from wearcap.files import content_hash
-from wearcap.localization.keypoint_flow import FlowSettings, tracked_cues
-from wearcap.localization.keypoints import MediaPipeHands, RecordedDetections, find_model, read_keypoints
 from wearcap.prepare.files import with_own_files
 from wearcap.recording.recording import CameraStream, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore

@@ -23,6 +23,7 @@ from wearcap.boundary.pickles import read_pickle, read_pickled_dict
 from wearcap.boundary.texts import finite_floats, read_text, read_yaml_object
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
+from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
@@ -31,7 +32,6 @@ from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
 from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, HeadStream, ImuStream, PointCloud, Recording
-from wearcap.sensors.camera_alignment import align_by_walks
 from wearcap.sensors.monocular_slam import clean_track
 
 VERSION = 2
@@ -57,6 +57,25 @@ class _BoardWalks:
     """Lengths of the paths along x and along y."""
     height_m: float
     """Height of the camera above the floor at the start of the path along y."""
+
+    def align(self) -> tuple[float, Rigid]:
+        """Scale (m per unit) and T_world_slam: p_world = T_world_slam @ (scale · p_slam).
+
+        The scale is the mean of both edges' (appendix C.2). The rotation aligns the walks with the world's x and y,
+        equally weighted, in closed form where the paper optimises; the origin is on the floor below the start of y.
+        Raises WearcapError for walks that are far from a right angle.
+        """
+        displacements = torch.stack([end[1] - end[0] for end in (self.x_slam, self.y_slam)]).double()
+        length = displacements.norm(dim=1)
+        if not (length > 0).all() or abs((displacements[0] @ displacements[1] / length.prod()).item()) > 0.5:
+            what = "the camera's paths along the board's edges are not at a right angle"
+            fix = "Check the times of the walks along x and y."
+            raise WearcapError(what, where="camera on the board", expected="about 90°", fix=fix)
+        scale = (torch.tensor(self.length_m, dtype=torch.float64) / length).mean().item()
+        axes = torch.eye(3, dtype=torch.float64)[:2]
+        R = rotation.nearest_rotation(axes.T @ (displacements / length[:, None]))
+        start = torch.tensor([0.0, 0.0, self.height_m], dtype=torch.float64)
+        return scale, Rigid(R, start - R @ (scale * self.y_slam[0].double())).to(torch.float32)
 
 
 @dataclass(frozen=True)
@@ -234,8 +253,7 @@ class MocapEverySettings:
                 expected = "cam_scale_origin in config.yaml, and x and y in camera_calib.pkl"
                 fix = "Measure it, and give scale=METRES_PER_UNIT."
                 raise WearcapError(what, where=folder, expected=expected, fix=fix)
-            board = read.board
-            return align_by_walks(board.x_slam, board.y_slam, board.length_m, board.height_m)
+            return read.board.align()
         if self.scale <= 0:
             raise WearcapError(f"scale={self.scale}", expected="metres per unit of SLAM, above 0")
         R_world_cam, _ = nominal_mount()

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from data_prep.aria_vrs import extract_video
 from data_prep.nymeria_alignment import align_head, clock_offset
 from data_prep.shared.engine import Splits, Task, changed, source_folder
 from wearcap.body.kinematics import local_rotations
@@ -30,7 +31,6 @@ from wearcap.io.devices.aria_mps import (
     read_closed_loop,
     read_mps_points,
 )
-from wearcap.io.devices.aria_vrs import extract_video
 from wearcap.reading.kinds import Kind, below
 from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
 

@@ -11,14 +11,61 @@ from torch import Tensor
 
 from data_prep.shared.engine import NOTE
 from data_prep.shared.mocap import About, MocapSettings, mocap_recording, on_xsens23, without_glitches
-from wearcap.data.objects import object_class
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, nearest
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.io.formats.environment import FILE_NAME, write_environment
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import Environment, Freedom, SceneObject
+
+_NAMES: dict[str, tuple[str, ...]] = {
+    "backpack": (),
+    "ball": ("basketball", "yogaball"),
+    "bottle": (),
+    "box": ("boxlarge", "boxlong", "boxmedium", "boxsmall", "boxtiny", "largebox", "plasticbox", "smallbox"),
+    "cabinet_door": (),
+    "chair": ("chairblack", "chairwood", "whitechair", "woodchair"),
+    "clothesstand": (),
+    "container": ("plasticcontainer",),
+    "door": (),
+    "drawer": (),
+    "floorlamp": (),
+    "keyboard": (),
+    "monitor": (),
+    "mop": (),
+    "sofa": (),
+    "stool": (),
+    "suitcase": (),
+    "table": ("largetable", "smalltable", "tablesmall", "tablesquare"),
+    "tool": (),
+    "toolbox": (),
+    "trashcan": ("trashbin",),
+    "tripod": (),
+    "vacuum": (),
+    "window": (),
+    "yogamat": (),
+}
+"""All classes in alphabetical order, with BEHAVE's and OMOMO's other names for them."""
+
+OBJECT_CLASSES: tuple[str, ...] = tuple(_NAMES)
+"""A class's index is its position here."""
+
+_CLASS_OF = {name: kind for kind, others in _NAMES.items() for name in (kind, *others)}
+
+
+def object_class(name: str) -> str:
+    """The class (of `OBJECT_CLASSES`) of an object by a data set's name, such as "largebox".
+
+    Raises WearcapError, which lists the accepted names, for any other.
+    """
+    if name not in _CLASS_OF:
+        near = nearest(name, _CLASS_OF)
+        hint = near if near.startswith("Did you mean") else ""
+        expected = f"one of {', '.join(sorted(_CLASS_OF))}"
+        fix = f"{hint} A new name belongs into data_prep/one_object.py.".strip()
+        raise WearcapError(f"no class for the object {name!r}", expected=expected, fix=fix)
+    return _CLASS_OF[name]
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,19 @@ import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
 import marker_person  # noqa: E402
 import short_walk  # noqa: E402
-from data_prep import adt, behave, egohoi, hcontact, hps, mocap_every_folder, nymeria, omomo, totalcapture, ui_prmd  # noqa: E402
+from data_prep import (  # noqa: E402
+    adt,
+    behave,
+    egohoi,
+    hcontact,
+    hps,
+    keypoint_detectors,
+    mocap_every_folder,
+    nymeria,
+    omomo,
+    totalcapture,
+    ui_prmd,
+)
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.boundary import arrays, pickles, texts  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
@@ -76,7 +88,6 @@ from wearcap.io.formats import (  # noqa: E402
     video,
     wavefront,
 )
-from wearcap.localization import keypoints  # noqa: E402
 from wearcap.prepare import foreign  # noqa: E402
 from wearcap.recording import Cue  # noqa: E402
 from wearcap.scene.scan import Photo  # noqa: E402
@@ -397,7 +408,7 @@ READERS: dict[str, Reader] = {
         lambda folder: hps.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt"),
     ),
     "json_text": one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', texts.read_json_object),
-    "keypoints_csv": made("k.csv", _cues, keypoints.read_keypoints),
+    "keypoints_csv": made("k.csv", _cues, keypoint_detectors.read_keypoints),
     "mocap_every": Reader(_mocap_every, mocap_every_folder.read_mocap_every_folder),
     "motion_npz": made("m.npz", lambda path: motion_npz.write_motion(swaying_motion(4), path), motion_npz.read_motion),
     "mvnx": one("m.mvnx", test_mvnx.mvnx(test_mvnx.sample(2)), mvnx.read_mvnx),

@@ -15,8 +15,9 @@ import torch
 from hydra.utils import instantiate
 
 from benchmarks.rivals import compose
+from benchmarks.rivals.bending import bend_adam
 from benchmarks.speed.figures import figure
-from wearcap.systems.ireplica.trajectory import BendingProblem, BentPath, bend_adam, bending_problem
+from wearcap.systems.ireplica.trajectory import BendingProblem, BentPath, bending_problem
 from wearcap.systems.ireplica.trajectory_banded import bend_banded
 
 RATES, LONGEST, WITHIN = (1e-3, 3e-3, 1e-2), 1000, 1.001

@@ -19,12 +19,12 @@ from benchmarks.tables import result_pages as pages
 from benchmarks.tables import tabling
 from benchmarks.tables.hmd2_runs import BASELINES, Case, Method, Result, run_method
 from benchmarks.tables.sensed import GIVEN, WRONG_HEIGHTS, add_sensors
+from benchmarks.tables.wearables import WEARABLES
 from wearcap.errors import WearcapError
 from wearcap.evaluation.breakdown import extremes
 from wearcap.metrics.table import P95, Scores, Summary, rich_lines, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
-from wearsim.sensors.wearables import WEARABLES
 
 COLUMNS = {
     "mpjpe_cm": "MPJPE",

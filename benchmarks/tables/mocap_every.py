@@ -21,12 +21,12 @@ from benchmarks.tables import tabling
 from benchmarks.tables.mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
 from benchmarks.tables.mocap_every_several import VIEW_DEG, Watched, session_rows, watched_pair, watched_person
 from benchmarks.tables.sensed import GIVEN, WRONG_HEIGHTS, add_sensors
+from benchmarks.tables.wearables import WEARABLES
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
-from wearsim.sensors.wearables import WEARABLES
 
 BODY = (
     "r_mpjpe_cm",

@@ -15,6 +15,7 @@ from scipy.stats import norm
 from torch import Tensor
 
 from benchmarks.tables.sensed import sensed
+from benchmarks.tables.two_wearers import face_to_face, simulate_two_wearers
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
@@ -28,7 +29,6 @@ from wearcap.sensors.simulated import smooth_noise
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.visual_cues import View, VisualCues, capture_session
 from wearsim.recordings.simulate import SimulationConfig
-from wearsim.recordings.two_wearers import face_to_face, simulate_two_wearers
 from wearsim.sensors.keypoints import ACTION_CAMERA, BURST_S, NEAR_M, action_camera, camera_path
 
 SCENES = (

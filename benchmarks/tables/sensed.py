@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tables.wearables import WEARABLES, WearableNoise, with_noise
 from wearcap.body.skeleton import skeleton_of_height
 from wearcap.recording import Recording, RecordingStore
 from wearcap.tracking.stature import skeleton_of
-from wearsim.sensors.wearables import WEARABLES, WearableNoise, with_noise
 
 GIVEN = "given"
 """Instead of a preset: the recording as it is, exact sensors, with the floor and the wearer's own bones given."""

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from benchmarks.tables.hps_sessions import TrueClock
 from benchmarks.tables.tabling import summarize
+from benchmarks.tables.wearables import WEARABLES
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -33,7 +34,6 @@ from wearsim.recordings.localization_noise import LocalizationNoise, by_gravity,
 from wearsim.recordings.measured import EnvironmentErrors, as_measured
 from wearsim.rendering.head_camera import HEAD_CAMERA_TRUTH, head_camera
 from wearsim.sensors.suit import SUITS, SuitNoise, suit_motion
-from wearsim.sensors.wearables import WEARABLES
 
 Values = dict[str, float]
 OUTLIER_M = 0.3

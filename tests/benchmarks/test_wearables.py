@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import wearables
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -13,7 +14,6 @@ from wearcap.recording import Recording
 from wearcap.recording.recording import FloorTrack, PointCloud
 from wearcap.sensors.simulated import SlamNoise, head_stream, slam_poses
 from wearcap_testing import swaying_motion
-from wearsim.sensors import wearables
 
 WEARABLES, WearableNoise = wearables.WEARABLES, wearables.WearableNoise
 

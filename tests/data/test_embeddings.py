@@ -11,9 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from data_prep.embeddings import embed_dataset
+from data_prep.embeddings import embed_camera, embed_dataset, embedding_name
 from wearcap.cli import prepare
-from wearcap.data.embeddings import embed_camera, embedding_name
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.models.image_encoder import EgoViewEncoder

@@ -9,7 +9,7 @@ from data_prep.shared.mocap import About, CleaningLimits, MocapSettings, foot_pa
 from wearcap.body.kinematics import local_rotations, site_positions
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.geometry import rotation
-from wearcap.prepare.levels import Levels, levels_in, with_levels
+from wearcap.prepare.levels import Levels, face_in, levels_in, with_levels
 from wearcap.recording import Motion
 
 SETTINGS = MocapSettings(60.0, (0.09, 0.0, 0.09), CleaningLimits(8.0, 15.0, 0.5, 0.06, 0.12))
@@ -65,7 +65,7 @@ def test_a_trusted_head_is_corrected_only_when_it_is_clearly_off(pitch, trusted,
     R = motion.T_world_joint.R.clone()
     R[:, motion.skeleton.index("head")] = rotation.about_axis("y", torch.tensor(pitch))
     motion = replace(motion, R_parent_joint=local_rotations(motion.skeleton, R))
-    levels = levels_in([motion], head_trusted=trusted)
+    levels = replace(levels_in([motion]), R_head_face=face_in([motion], trusted))
     assert (levels.R_head_face is not None) == corrected
     face = with_levels(motion, levels).joint("head").R[0, 2, 0]
     assert (abs(torch.rad2deg(-face.asin()).item() - 7) < 0.5) == corrected

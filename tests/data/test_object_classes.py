@@ -2,7 +2,7 @@
 
 import pytest
 
-from wearcap.data.objects import OBJECT_CLASSES, object_class
+from data_prep.one_object import OBJECT_CLASSES, object_class
 from wearcap.errors import WearcapError
 
 BEHAVE = (

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from data_prep import keypoints
+from data_prep.keypoint_detectors import Keypoint
 from data_prep.keypoints import Found, Recorded, Simulated, keypoints_dataset
 from keypoint_files import write_keypoints
 from wearcap.cli import prepare
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.video import write_frames
-from wearcap.localization.keypoints import Keypoint
 from wearcap.recording import CameraStream, Cue, Recording, RecordingStore
 from wearcap_testing import small_dataset
 from wearsim.sensors.keypoints import ACTION_CAMERA

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from data_prep import aria_vrs
 from wearcap.cli import prepare as verb
 from wearcap.errors import WearcapError
-from wearcap.io.devices import aria_vrs
 from wearcap.recording import RecordingStore
 
 

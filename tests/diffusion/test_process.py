@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from wearcap.diffusion.process import add_noise, posterior_step, sample
-from wearcap.diffusion.schedule import CosineSchedule, LinearSchedule
+from wearcap.diffusion.schedule import CosineSchedule
 
-SCHEDULES = [CosineSchedule(), LinearSchedule()]
+SCHEDULES = [CosineSchedule(), CosineSchedule(0.1)]
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)

@@ -4,10 +4,10 @@ import pytest
 import torch
 from hypothesis import given
 
+from data_prep.keypoint_detectors import read_keypoints
 from hostile import fuzz, mutated
 from keypoint_files import write_keypoints
 from wearcap.errors import WearcapError
-from wearcap.localization.keypoints import read_keypoints
 from wearcap.recording import Cue
 
 HEADER = "timestamp,joint,x,y,confidence\n"

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from mocap_every_files import BOARD_M, FIX, SCALE, SHUTTER_S, cloud, truth, world_of, write_capture
 
 from data_prep.mocap_every_folder import (
-    _BoardWalks,
     is_mocap_every_folder,
     mocap_every_files,
     mocap_every_recording,
@@ -22,11 +21,6 @@ from data_prep.mocap_every_folder import (
 from hostile import fuzz, mutated, mutated_bytes
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.sensors.camera_alignment import align_by_walks
-
-
-def aligned(board: _BoardWalks):
-    return align_by_walks(board.x_slam, board.y_slam, board.length_m, board.height_m)
 
 
 def test_everything_is_read(tmp_path):
@@ -50,7 +44,7 @@ def test_everything_is_read(tmp_path):
 def test_the_board_gives_scale_and_axes(tmp_path):
     write_capture(tmp_path)
     read = read_mocap_every_folder(tmp_path)
-    scale, T_world_slam = aligned(read.board)
+    scale, T_world_slam = read.board.align()
     assert scale == pytest.approx(SCALE, rel=1e-5)
     recording = mocap_every_recording(read, scale, T_world_slam)
     t, R = truth()
@@ -163,7 +157,7 @@ def test_a_board_without_a_right_angle_is_refused(tmp_path):
     write_capture(tmp_path)
     board = read_mocap_every_folder(tmp_path).board
     with pytest.raises(WearcapError, match="not at a right angle"):
-        aligned(replace(board, y_slam=board.x_slam))
+        replace(board, y_slam=board.x_slam).align()
 
 
 @fuzz
@@ -183,7 +177,7 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory, data):
         path.write_text(data.draw(mutated(content.decode())))
     try:
         read = read_mocap_every_folder(folder)
-        recording = mocap_every_recording(read, *(aligned(read.board) if read.board else ()))
+        recording = mocap_every_recording(read, *(read.board.align() if read.board else ()))
     except WearcapError:
         return
     assert recording.head.R_world_device.isfinite().all()

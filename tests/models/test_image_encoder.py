@@ -5,8 +5,9 @@ import json
 import pytest
 import torch
 
+from data_prep.embeddings import ImageEncoder
 from wearcap.errors import WearcapError
-from wearcap.models.image_encoder import EgoViewEncoder, ImageEncoder, letterboxed
+from wearcap.models.image_encoder import EgoViewEncoder, letterboxed
 
 pytestmark = pytest.mark.usefixtures("trusted")
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import two_wearers
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
@@ -13,7 +14,6 @@ from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.visual_cues import View, VisualCues, capture_session
 from wearcap.tracking.anchor import anchored_to_head
-from wearsim.recordings import two_wearers
 from wearsim.recordings.simulate import SimulationConfig
 
 

@@ -164,7 +164,7 @@ def test_gravity_is_found_in_a_map_that_is_not_level(lean_deg):
     lean = rotation.exp(torch.tensor([0.0, np.deg2rad(lean_deg), 0.0]).float())
     found = localized(motion, LocalizationNoise())
     found = replace(found, R_world_cam=lean @ found.R_world_cam, t_world_cam=found.t_world_cam @ lean.mT)
-    up = gravity_in_map(motion, found, MOUNT.R)
+    up = gravity_in_map(motion, found)
     expected = lean[:, 2].double() if lean_deg < 5.0 else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     assert torch.linalg.cross(up, expected).norm() < np.deg2rad(0.3)
 

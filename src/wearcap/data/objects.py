@@ -1,63 +1,15 @@
-"""Objects as conditions of networks: point clouds of their surfaces, and the classes of the data sets' names."""
+"""Objects as conditions of networks: point clouds of their surfaces."""
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.errors import WearcapError, nearest
+from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 
 POINTS = 1500
 """Number of points of a cloud."""
-
-_NAMES: dict[str, tuple[str, ...]] = {
-    "backpack": (),
-    "ball": ("basketball", "yogaball"),
-    "bottle": (),
-    "box": ("boxlarge", "boxlong", "boxmedium", "boxsmall", "boxtiny", "largebox", "plasticbox", "smallbox"),
-    "cabinet_door": (),
-    "chair": ("chairblack", "chairwood", "whitechair", "woodchair"),
-    "clothesstand": (),
-    "container": ("plasticcontainer",),
-    "door": (),
-    "drawer": (),
-    "floorlamp": (),
-    "keyboard": (),
-    "monitor": (),
-    "mop": (),
-    "sofa": (),
-    "stool": (),
-    "suitcase": (),
-    "table": ("largetable", "smalltable", "tablesmall", "tablesquare"),
-    "tool": (),
-    "toolbox": (),
-    "trashcan": ("trashbin",),
-    "tripod": (),
-    "vacuum": (),
-    "window": (),
-    "yogamat": (),
-}
-"""All classes in alphabetical order, with BEHAVE's and OMOMO's other names for them."""
-
-OBJECT_CLASSES: tuple[str, ...] = tuple(_NAMES)
-"""A class's index is its position here."""
-
-_CLASS_OF = {name: kind for kind, others in _NAMES.items() for name in (kind, *others)}
-
-
-def object_class(name: str) -> str:
-    """The class (of `OBJECT_CLASSES`) of an object by a data set's name, such as "largebox".
-
-    Raises WearcapError, which lists the accepted names, for any other.
-    """
-    if name not in _CLASS_OF:
-        near = nearest(name, _CLASS_OF)
-        hint = near if near.startswith("Did you mean") else ""
-        expected = f"one of {', '.join(sorted(_CLASS_OF))}"
-        fix = f"{hint} A new name belongs into data/objects.py.".strip()
-        raise WearcapError(f"no class for the object {name!r}", expected=expected, fix=fix)
-    return _CLASS_OF[name]
 
 
 def object_cloud(mesh: Mesh, count: int = POINTS, seed: int = 0) -> Float[Tensor, "point 3"]:

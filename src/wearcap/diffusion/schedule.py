@@ -20,13 +20,3 @@ class CosineSchedule:
     def __call__(self, level: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         start = math.cos(math.pi / 2 * self.offset / (1 + self.offset)) ** 2
         return torch.cos(math.pi / 2 * (level + self.offset) / (1 + self.offset)) ** 2 / start
-
-
-class LinearSchedule:
-    """ᾱ(l) = exp(-β₀ l - (β₁ - β₀) l² / 2): linearly growing β (Ho et al. 2020) in its continuous limit."""
-
-    def __init__(self, beta_start: float = 0.1, beta_end: float = 20.0):
-        self.beta_start, self.beta_end = beta_start, beta_end
-
-    def __call__(self, level: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        return torch.exp(-level * self.beta_start - 0.5 * level**2 * (self.beta_end - self.beta_start))

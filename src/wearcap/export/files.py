@@ -79,11 +79,11 @@ class _Sidecar(msgspec.Struct):
     weights: dict[_Name, _File]
 
 
-def load_exported(path: str | Path, network: str | None = None) -> Any:
+def load_exported(path: str | Path) -> Any:
     """The system (for iReplica: the contact detector) of an exported model, from its files.
 
-    `network`: the expected system's name. Raises WearcapError when a file is missing, unreadable, of another system, or
-    does not belong to the others, for a sidecar of another layout, and for somebody else's .pt2.
+    Raises WearcapError when a file is missing, unreadable, of no known system, or does not belong to the others, for a
+    sidecar of another layout, and for somebody else's .pt2.
     """
     file_size(path, "exported model")
     if Path(path).suffix == ".pt2":
@@ -97,8 +97,8 @@ def load_exported(path: str | Path, network: str | None = None) -> Any:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
     about = require_layout(content, _Sidecar, sidecar)
     name, package = about.network, f"wearcap.systems.{about.network}"
-    if (network or name) != name or not all(map(importlib.util.find_spec, (package, f"{package}.export"))):
-        raise WearcapError(f"a {name} network", where=path, expected=f"a {network or 'known'} network")
+    if not all(map(importlib.util.find_spec, (package, f"{package}.export"))):
+        raise WearcapError(f"a {name} network", where=path, expected="a known network")
     files = {Path(path): about.model}
     files |= {_file_of(path, part): entry for part, entry in about.parts.items()}
     files |= {_file_of(path, part, weights=True): entry for part, entry in about.weights.items()}

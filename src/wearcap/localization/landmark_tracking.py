@@ -15,14 +15,13 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.absolute_pose import CameraPose, Fit, Matches
-from wearcap.localization.keypoint_flow import flow_there_and_back
 from wearcap.localization.localizer import Localizer, confidence, counted, localization_of
 from wearcap.localization.point_map import check_size, undistortion
 from wearcap.localization.pose_chain import ChainedPose, joined
@@ -250,6 +249,25 @@ def track_video(
     for number, frame in enumerate(counted(ahead, len(times), progress)):
         tracker.advance(times[number], frame)
     return localization_of(tracker.poses(), timestamps)
+
+
+def flow_there_and_back(
+    before: np.ndarray,
+    after: np.ndarray,
+    start: Float32[np.ndarray, "point 2"],
+    window_px: int,
+    levels: int,
+    guess: Float32[np.ndarray, "point 2"] | None = None,
+) -> tuple[Float32[np.ndarray, "point 2"], Float32[np.ndarray, "point"], Bool[np.ndarray, "point"]]:
+    """Points' places in the next picture by optical flow (from a guess of them, if any), how far (px) from their start the
+    flow back takes them, and which are found both ways, within the picture."""
+    options = {"winSize": (window_px, window_px), "maxLevel": levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    first = np.array(start if guess is None else guess)
+    end, there, _ = cv2.calcOpticalFlowPyrLK(before, after, start, first, **options)  # type: ignore[call-overload]
+    first = np.array(end if guess is None else start)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, first, **options)  # type: ignore[call-overload]
+    inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
+    return end, np.linalg.norm(back - start, axis=-1), (there[:, 0] == 1) & (again[:, 0] == 1) & inside
 
 
 def _expected(track: _Track) -> Float32[np.ndarray, "landmark 2"]:

@@ -32,7 +32,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.data.motion_features": ("MotionFeatures",),
     "wearcap.systems.mocap_every.features": ("WatchFeatures",),
     "wearcap.diffusion.levels": ("LevelMix",),
-    "wearcap.diffusion.schedule": ("CosineSchedule", "LinearSchedule"),
+    "wearcap.diffusion.schedule": ("CosineSchedule",),
     "wearcap.systems.ireplica.contact_sequence": ("ContactSequence",),
     "wearcap.systems.ireplica.contact_transformer": ("ContactTransformer",),
     "wearcap.systems.hmd2.model": ("MotionDenoiser",),

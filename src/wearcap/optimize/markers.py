@@ -143,10 +143,10 @@ def fit_body(trials: Sequence[Markers]) -> MarkerBody:
         parts.append(whole[torch.linspace(0, len(whole.y) - 1, min(count, len(whole.y))).round().long()])
     seen = _Seen(torch.cat([part.y for part in parts]), torch.cat([part.weight for part in parts]))
     R, t = _solve_poses(body, seen, *(torch.cat(part) for part in zip(*(_start(body, part) for part in parts))))
-    body = _levelled(body, seen, R, t, {"pelvis": 0.0, "t8": 0.0})
+    body = _levelled(body, R, t, {"pelvis": 0.0, "t8": 0.0})
     body, R, t = _solve_body(body, seen, R, t)
     # Nothing but markers hangs on head and feet: their frames can be turned without another change.
-    return _levelled(body, seen, R, t, {"head": _NOD, "left_ankle": 0.0, "right_ankle": 0.0})
+    return _levelled(body, R, t, {"head": _NOD, "left_ankle": 0.0, "right_ankle": 0.0})
 
 
 def fit_motion(body: MarkerBody, trial: Markers) -> tuple[Motion, Float[Tensor, "time marker"]]:
@@ -203,7 +203,7 @@ def _nominal_body(names: tuple[str, ...], trials: Sequence[Markers]) -> MarkerBo
     return MarkerBody(base.scaled(scale), names, a, b, offsets)
 
 
-def _levelled(body: MarkerBody, seen: _Seen, R: Tensor, t: Tensor, pitches: dict[str, float]) -> MarkerBody:
+def _levelled(body: MarkerBody, R: Tensor, t: Tensor, pitches: dict[str, float]) -> MarkerBody:
     """The body with joints' frames turned so that they have a pitch (rad, downward) while people stand, the head highest.
 
     Pelves are tilted, and bands worn, by each person in another way.

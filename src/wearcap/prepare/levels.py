@@ -42,11 +42,8 @@ class Levels:
     R_pelvis: Float[Tensor, "3 3"] | None = None
 
 
-def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
-    """Estimate the tilts from motions of one wearer, all on one skeleton.
-
-    A trusted head frame is corrected only if it is clearly off.
-    """
+def levels_in(motions: Sequence[Motion]) -> Levels:
+    """Estimate the tilts from motions of one wearer, all on one skeleton."""
     soles = {}
     for side in ("left", "right"):
         still = [_standing(motion, side) for motion in motions]
@@ -57,7 +54,7 @@ def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
             direction = torch.nn.functional.normalize(up.median(0).values, dim=0)
             if direction[2] > torch.tensor(_LARGEST_TILT).cos():
                 soles[name] = swing_between(direction.new_tensor([0.0, 0.0, 1.0]), direction)
-    return Levels(face_in(motions, head_trusted), soles, pelvis_in(motions))
+    return Levels(face_in(motions), soles, pelvis_in(motions))
 
 
 def face_in(motions: Sequence[Motion], trusted: bool = False) -> Float[Tensor, "3 3"] | None:

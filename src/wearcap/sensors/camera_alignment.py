@@ -1,8 +1,7 @@
 """Alignment of a monocular SLAM's world by a board, and calibration of the head camera's mount (MocapEvery C.2).
 
 The camera is put on four positions (`align_by_marks`): C1 and C2 on the board's y axis, C3 and C4 on its x axis, at
-measured distances; the origin is where the axes meet. Or it is carried along the board's edges, as in MocapEvery's
-own capture folders (`align_by_walks`). p_world = scale · R_world_slam p_slam + t_world_slam. Cameras are OpenCV's.
+measured distances; the origin is where the axes meet. p_world = scale · R_world_slam p_slam + t_world_slam. Cameras are OpenCV's.
 """
 
 import math
@@ -18,7 +17,6 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.recording import HeadStream
 from wearcap.sensors.stillness import StepCheck, Stretch, during, unstillness_deg
@@ -196,31 +194,6 @@ def align_by_marks(
         float(abs(scales[0] - scales[1]) / scales.mean()),
         abs(90 - math.degrees(math.acos(np.clip(lines[0] @ lines[1] / lengths.prod(), -1, 1)))),
     )
-
-
-def align_by_walks(
-    x_slam: Float[Tensor, "end 3"], y_slam: Float[Tensor, "end 3"], length_m: tuple[float, float], height_m: float
-) -> tuple[float, Rigid]:
-    """Scale (m per unit) and T_world_slam of a camera that was carried along the board's x and y edge.
-
-    p_world = T_world_slam @ (scale · p_slam). Inputs are the end points of both walks, the lengths of the edges (m) and
-    the camera's height above the floor at the start of the walk along y (m).
-
-    The scale is the mean of both edges' (appendix C.2). The rotation aligns the walks with the world's x and y, equally
-    weighted, in closed form where the paper optimises; the origin is on the floor below the start of y.
-    Raises WearcapError for walks that are far from a right angle.
-    """
-    displacements = torch.stack([end[1] - end[0] for end in (x_slam, y_slam)]).double()
-    length = displacements.norm(dim=1)
-    if not (length > 0).all() or abs((displacements[0] @ displacements[1] / length.prod()).item()) > 0.5:
-        what = "the camera's paths along the board's edges are not at a right angle"
-        fix = "Check the times of the walks along x and y."
-        raise WearcapError(what, where="camera on the board", expected="about 90°", fix=fix)
-    scale = (torch.tensor(length_m, dtype=torch.float64) / length).mean().item()
-    axes = torch.eye(3, dtype=torch.float64)[:2]
-    R = rotation.nearest_rotation(axes.T @ (displacements / length[:, None]))
-    start = torch.tensor([0.0, 0.0, height_m], dtype=torch.float64)
-    return scale, Rigid(R, start - R @ (scale * y_slam[0].double())).to(torch.float32)
 
 
 def mount_by_standing(

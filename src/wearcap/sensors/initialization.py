@@ -42,7 +42,7 @@ def align_suit(
     must agree already. Raises WearcapError when no localised frame lies within the suit's time.
     """
     if tilt:
-        up = gravity_in_map(suit, localization, mount.R).float()
+        up = gravity_in_map(suit, localization).float()
         R_map_suit = rotation.exp(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), up))
         suit = suit.moved(Rigid(R_map_suit, suit.t_world_root[0] - R_map_suit @ suit.t_world_root[0]))
     inside = _inliers_during(suit, localization)
@@ -67,13 +67,13 @@ def align_suit(
     return suit.moved(Rigid(R_scene_suit, move)), turn
 
 
-def gravity_in_map(suit: Motion, localization: Localization, R_head_cam: Float[Tensor, "3 3"]) -> Float64[Tensor, "3"]:
+def gravity_in_map(suit: Motion, localization: Localization) -> Float64[Tensor, "3"]:
     """Direction (unit vector, map axes) that the suit's sensors measure as up, where a map is not level.
 
     Independent of the heading, which may drift: seen from the camera, up is R_world_cam^T n by the map and
-    R_head_cam^T R_world_head^T e_z by the suit. n and the mount R_head_cam, of which the nominal value is the first
-    guess, are found in turn by weighted means (Wahba's problem) whose weights fall with the angle between both. A
-    wearer who looks into different directions separates the two; beyond `MOST_TILT_DEG` the map is taken as level.
+    R_head_cam^T R_world_head^T e_z by the suit. n and the mount R_head_cam are found in turn by weighted means (Wahba's
+    problem) whose weights fall with the angle between both. A wearer who looks into different directions separates the
+    two; beyond `MOST_TILT_DEG` the map is taken as level.
     """
     level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     seen = _inliers_during(suit, localization)

@@ -189,7 +189,7 @@ def _alike(slam: Trajectory, imu: ImuStream, T_cam_imu: Rigid) -> tuple[np.ndarr
 
 
 def by_floor(
-    slam: Trajectory, points_slam: Float[Tensor, "point 3"], standing: Stretch, height_m: float, seed: int = 0
+    slam: Trajectory, points_slam: Float[Tensor, "point 3"], standing: Stretch, height_m: float
 ) -> SlamAlignment:
     """Scale and vertical (`_upright`) from the floor below the path, and the camera's height above it while standing (m).
 
@@ -200,7 +200,7 @@ def by_floor(
     if not 0.5 < height_m < 2.5:
         what = f"a standing height of {height_m} m"
         raise WearcapError(what, where="scale from the floor", expected="0.5 m to 2.5 m")
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     eyes = slam.t_world_body[during(slam.timestamps, standing, "standing", 1.0)].double().mean(0).numpy()
     rough = -slam.R_world_body[:, :, 1].double().mean(0).numpy()
     rough /= np.linalg.norm(rough)

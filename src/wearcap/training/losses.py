@@ -23,15 +23,6 @@ def masked_mean(value: Float[Tensor, "batch time"], weight: Float[Tensor, "batch
     return (value * weight).mean()
 
 
-def motion_mse(
-    prediction: Float[Tensor, "batch time motion"],
-    target: Float[Tensor, "batch time motion"],
-    weight: Float[Tensor, "batch time"],
-) -> Float[Tensor, ""]:
-    """Squared error of x̂0 in normalised motion space (thesis eq. 6.4)."""
-    return masked_mean((prediction - target).square().mean(-1), weight)
-
-
 def joint_position(
     prediction: Float[Tensor, "batch time joint 3"],
     target: Float[Tensor, "batch time joint 3"],

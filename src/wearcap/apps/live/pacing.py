@@ -55,8 +55,6 @@ class Playout:
     """
 
     def __init__(self):
-        self.dropped_s = 0.0
-        """Time (s) of motion that was not shown because the screen was behind."""
         self._pieces: deque[Motion] = deque(maxlen=MAX_PIECES)
         self._spans: deque[float] = deque(maxlen=5)
         self._shown_s: float | None = None
@@ -93,7 +91,6 @@ class Playout:
                 speed = 1 + 0.5 * (newest - self._shown_s - target)
                 self._shown_s += max(now_s - self._last_s, 0.0) * min(max(speed, SLOWEST), FASTEST)
             if newest - self._shown_s > target + BEHIND_S:
-                self.dropped_s += newest - target - self._shown_s
                 self._shown_s = newest - target
             self._shown_s = min(max(self._shown_s, self._pieces[0].timestamps[0].item()), newest)
             self._last_s = now_s

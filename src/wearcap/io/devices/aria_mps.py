@@ -47,7 +47,7 @@ _SUBFOLDERS = (".", "slam", "trajectory", "mps/slam", "mps/trajectory")
 def nominal_T_aria_cpf() -> Rigid:
     """CAD pose of the central pupil frame in the device frame of Gen 1 glasses, small size ("DVT-S").
 
-    The large size differs by 2.4 mm; a VRS file's calibration gives the wearer's own (io/devices/aria_vrs.py).
+    The large size differs by 2.4 mm; a VRS file's calibration gives the wearer's own (data_prep/aria_vrs.py).
     Source: projectaria_tools, DeviceCadExtrinsics, row camera-slam-left (position, y axis, z axis in cpf).
     """
     y = torch.nn.functional.normalize(torch.tensor([0.793353, 0.0, -0.608761], dtype=torch.float64), dim=0)

@@ -10,7 +10,6 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import roma
@@ -106,21 +105,12 @@ def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapM
     return ColmapModel([_photo(image, cameras, images) for image in found], _tracks(found, points))
 
 
-class ImagePose(NamedTuple):
-    """Name and pose of a registered picture: p_cam = R(quaternion) p_world + translation."""
-
-    name: str
-    quaternion_wxyz: tuple[float, ...]
-    translation: tuple[float, ...]
-
-
-def read_image_poses(path: str | Path) -> list[ImagePose]:
-    """Names and poses of an images.txt or images.bin alone, as they stand there.
+def read_images(path: str | Path) -> list[_Image]:
+    """The pictures of an images.txt or images.bin alone, as they stand there.
 
     Raises WearcapError for a truncated file and lines that are none of its format.
     """
-    reader = _Binary if Path(path).suffix == ".bin" else _Text
-    return [ImagePose(image.name, image.quaternion_wxyz, image.translation) for image in reader.images(Path(path))]
+    return (_Binary if Path(path).suffix == ".bin" else _Text).images(Path(path))
 
 
 def _photo(image: _Image, cameras: dict[int, Camera], images: Path) -> Photo:

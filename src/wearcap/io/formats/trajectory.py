@@ -32,7 +32,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.camera_frames import NAMES, is_camera_frames, read_camera_frames
-from wearcap.io.formats.colmap import read_image_poses
+from wearcap.io.formats.colmap import read_images
 from wearcap.io.formats.csv_table import read_columns
 from wearcap.io.formats.pose_columns import (
     EUROC,
@@ -364,7 +364,7 @@ def _kitti(path: Path) -> _Table:
 
 
 def _from_images(path: Path) -> _Table:
-    images = read_image_poses(path)
+    images = read_images(path)
     poses = ((image.name, (*image.quaternion_wxyz, *image.translation)) for image in images)
     return _of_pictures("COLMAP", poses, path)
 

@@ -4,6 +4,7 @@ In wearcap's axes (z up, metres). Time code 0 is the motion's first frame, a tim
 and frames that are not evenly spaced have codes between whole ones. Needs the extra `usd`.
 """
 
+# pyright: reportAttributeAccessIssue=false
 import shutil
 import tempfile
 from collections import Counter

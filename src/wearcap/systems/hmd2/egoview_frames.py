@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
-from wearcap.data.embeddings import pictures
+from wearcap.data.pictures import pictures
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path

@@ -177,7 +177,7 @@ class MotionDiffusion(Training):
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
         weight = valid * (1 + self.loss.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
         pose = slice(self.features.pose_size)
-        terms = {"motion": losses.motion_mse(x0_hat[..., pose], x0[..., pose], weight)}
+        terms = {"motion": losses.masked_mean((x0_hat - x0)[..., pose].square().mean(-1), weight)}
         if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate", "contact")):
             motion_hat = self.net.motion_normalizer.inverse(x0_hat)
             R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)

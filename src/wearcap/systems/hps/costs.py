@@ -13,14 +13,14 @@ def head_orientation(
     R_world_head: Float[Tensor, "time 3 3"], R_head_cam: Float[Tensor, "3 3"], R_world_cam: Float[Tensor, "time 3 3"]
 ) -> Float[Tensor, "time 3"]:
     """Rotation (rad, world axes) from the body's camera R^H(θ) R_HC to the localised one (thesis eq. 4.2–4.4)."""
-    return _turn(R_world_head @ R_head_cam, R_world_cam)
+    return rotation_offset(R_world_head @ R_head_cam, R_world_cam)
 
 
 def rotation_offset(
-    R_world_body: Float[Tensor, "time 3 3"], expected: Float[Tensor, "time 3 3"]
-) -> Float[Tensor, "time 3"]:
+    R_world_body: Float[Tensor, "*batch 3 3"], expected: Float[Tensor, "*batch 3 3"]
+) -> Float[Tensor, "*batch 3"]:
     """Rotation (rad, world axes) from a body's orientation to the expected one, such as the suit's (ours)."""
-    return _turn(R_world_body, expected)
+    return rotation.log(expected @ R_world_body.transpose(-1, -2))
 
 
 def position_offset(
@@ -56,7 +56,7 @@ def rotation_step(
 
     An expected rotation has the form R_world_body[j + 1] R_world_body[j]ᵀ.
     """
-    return _turn(expected @ R_world_body[:-1], R_world_body[1:])
+    return rotation_offset(expected @ R_world_body[:-1], R_world_body[1:])
 
 
 def pose_offset(
@@ -71,8 +71,3 @@ def pose_step(
 ) -> Float[Tensor, "pair component"]:
     """Change of the deviation from the suit's pose from frame to frame; the suit's errors vary slowly (ours)."""
     return pose_offset(theta, theta_imu).diff(dim=0)
-
-
-def _turn(R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Rotation vector (world axes, rad) that rotates a into b."""
-    return rotation.log(R_b @ R_a.transpose(-1, -2))

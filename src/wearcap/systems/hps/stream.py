@@ -421,11 +421,9 @@ class HpsSession(Session):
 
     devices = ("suit", "camera")
 
-    def __init__(
-        self, hps: HPS, wearers: Sequence[Recording], scan: Scan | None, settings: StreamSettings | None = None
-    ):
+    def __init__(self, hps: HPS, wearers: Sequence[Recording], scan: Scan | None):
         """`wearers`: each one's shape and camera (`HpsStream`). Raises WearcapError as `HpsStream` does."""
-        super().__init__(hps, [HpsStream(hps, about, scan, settings) for about in wearers])
+        super().__init__(hps, [HpsStream(hps, about, scan) for about in wearers])
 
     @classmethod
     def of_wearers(

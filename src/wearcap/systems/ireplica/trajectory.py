@@ -1,5 +1,4 @@
-"""Trajectory correction (thesis eq. 5.1, 5.2): bends a path in the ground plane to control points; problem, energy,
-Adam.
+"""Trajectory correction (thesis eq. 5.1, 5.2): bends a path in the ground plane to control points: the problem.
 
 A suit measures distances well and headings badly: step lengths are kept, headings are unknown. A step is the
 displacement from one frame to the next. The unknowns are the turns φ = α̂ − α of the steps, so l̂ = l(0) + Σ R(φ) step,
@@ -19,19 +18,16 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import require_rising
 from wearcap.optimize.losses import Loss
 
-NORMS = ("square", "absolute")
 STILL_M = 1e-6
 """Steps up to this length have no heading."""
 
 
 @dataclass(frozen=True)
 class Bending:
-    """Parameters of eq. 5.2. Raises WearcapError for a rigidity that is not positive or an unknown norm."""
+    """Parameters of eq. 5.2. Raises WearcapError for a rigidity that is not positive."""
 
     rigidity: float
-    """λ: metres of the control term per unit of E_tr (rad²/s, or rad for "absolute")."""
-    norm: str = "square"
-    """Penalty on the difference of heading rates, which eq. 5.1 does not print: ∫ (dα̂/dτ − dα/dτ)² dτ, or ∫ |…| dτ."""
+    """λ: metres of the control term per unit of E_tr (rad²/s), the integral of the squared difference of heading rates."""
     loss: Loss = field(default_factory=lambda: Loss("norm"))
     """Loss of a control point's distance: the thesis's norm; "huber", or "cauchy" for bursts of wrong points (ours)."""
     free_start: bool = False
@@ -42,8 +38,6 @@ class Bending:
     def __post_init__(self):
         if not (self.rigidity > 0 and math.isfinite(self.rigidity)):
             raise WearcapError(f"a rigidity of {self.rigidity}", expected="a positive number")
-        if self.norm not in NORMS:
-            raise WearcapError(f"no norm {self.norm!r} of heading rates", expected=f"one of {', '.join(NORMS)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,25 +174,6 @@ def bent(
     return torch.cat([start, start + turned.cumsum(0)])
 
 
-def energy_terms(
-    problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
-) -> dict[str, Float64[Tensor, ""]]:
-    """Terms of eq. 5.2, differentiable in φ (rad) and the first point's shift (m); the path is linear within steps. The
-    change dα̂ − dα from step to step (eq. 5.1) is that of φ, with clamped ends also from and to the fixed steps."""
-    settings, path = problem.settings, bent(problem, turn, shift)
-    at, share = problem.control_step, problem.control_share[:, None]
-    offset = torch.lerp(path[at], path[at + 1], share) - problem.control_points
-    off = turn[problem.leader]
-    change = torch.cat([off[:1], off.diff(), -off[-1:]]) if settings.clamped_ends else off.diff()
-    change = wrapped(change)
-    seconds = problem.link_s if settings.clamped_ends else problem.link_s[1:-1]
-    tension = change**2 / seconds if settings.norm == "square" else change.abs()
-    return {
-        "control": (problem.control_weights * settings.loss(offset)).sum(),
-        "bending": settings.rigidity * tension.sum(),
-    }
-
-
 def bent_path(
     problem: BendingProblem,
     turn: Float64[Tensor, "step"],
@@ -210,23 +185,3 @@ def bent_path(
     turn = turn[problem.leader]
     turn = torch.cat([wrapped(turn[:1]), wrapped(turn.diff())]).cumsum(0)
     return BentPath(bent(problem, turn, shift), turn, history, reason)
-
-
-def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 3e-3) -> BentPath:
-    """The thesis's solver (§5.4.2): Adam, its learning rate in rad and m. Returns the best state of all iterations."""
-    turn = torch.zeros(len(problem.leader), dtype=torch.float64, requires_grad=True)
-    shift = torch.zeros(2, dtype=torch.float64, requires_grad=problem.settings.free_start)
-    unknowns = [value for value in (turn, shift) if value.requires_grad]
-    adam = torch.optim.Adam(unknowns, lr=learning_rate)
-    history, least, best = [], math.inf, (turn.detach(), shift.detach())
-    for iteration in range(iterations + 1):
-        adam.zero_grad()
-        terms = energy_terms(problem, turn, shift)
-        total = terms["control"] + terms["bending"]
-        history.append({name: value.item() for name, value in terms.items()} | {"total": total.item()})
-        if history[-1]["total"] < least:
-            least, best = history[-1]["total"], (turn.detach().clone(), shift.detach().clone())
-        if iteration < iterations:
-            total.backward()
-            adam.step()
-    return bent_path(problem, *best, history, f"{iterations} iterations")

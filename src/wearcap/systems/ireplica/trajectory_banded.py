@@ -14,9 +14,8 @@ import torch
 from wearcap.geometry.compiled import compiled
 from wearcap.optimize.losses import LOSSES
 from wearcap.systems.hps.banded_kernels import NORM, reweight
-from wearcap.systems.ireplica.trajectory import NORMS, BendingProblem, BentPath, bent_path
+from wearcap.systems.ireplica.trajectory import BendingProblem, BentPath, bent_path
 
-SQUARE = 0  # of trajectory.NORMS
 TINY = 1e-12
 
 
@@ -64,13 +63,10 @@ def _stretch_freely(step, link, last_link, first, share, target, weight, distanc
 
 
 @compiled
-def _link_form(change, link, norm, smooth):
-    """(energy of a link, curvature of its quadratic approximation, change wrapped to ±π)."""
+def _link_form(change, link):
+    """(energy of a link, its curvature, change wrapped to ±π)."""
     change -= 2 * np.pi * np.round(change / (2 * np.pi))
-    if norm == SQUARE:
-        return link * change * change, 2 * link, change
-    rounded = np.sqrt(change * change + smooth * smooth)
-    return link * rounded, link / rounded, change
+    return link * change * change, 2 * link, change
 
 
 @compiled
@@ -82,18 +78,18 @@ def _control_form(square, loss, delta, smooth):
 
 @compiled
 def _energy(turn, place, link, last_link, first, share, target, weight, kinds, smooth):
-    """(control, bending) energy of a path; `kinds`: norm of the links, loss, its delta; `smooth` in m and rad."""
-    norm, loss, delta = kinds
+    """(control, bending) energy of a path; `kinds`: loss, its delta; `smooth` in m."""
+    loss, delta = kinds
     control, bending, before = 0.0, 0.0, 0.0
     for s in range(len(turn)):
         if not np.isinf(link[s]):
-            bending += _link_form(turn[s] - before, link[s], norm, smooth)[0]
+            bending += _link_form(turn[s] - before, link[s])[0]
         before = turn[s]
         for i in range(first[s], first[s + 1]):
             x = place[s, 0] + share[i] * (place[s + 1, 0] - place[s, 0]) - target[i, 0]
             y = place[s, 1] + share[i] * (place[s + 1, 1] - place[s, 1]) - target[i, 1]
             control += weight[i] * _control_form(x * x + y * y, loss, delta, smooth)[0]
-    return control, bending + _link_form(before, last_link, norm, smooth)[0]
+    return control, bending + _link_form(before, last_link)[0]
 
 
 @compiled
@@ -102,10 +98,10 @@ def _value_pass(turn, place, link, last_link, first, share, target, weight, kind
 
     Returns the quadratic form (xx, xy, yy, x, y) of the least energy in the change of the first point.
     """
-    norm, loss, delta = kinds
+    loss, delta = kinds
     count = len(turn)
     xx, xy, yy, xt, yt, gx, gy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    _, tt, off = _link_form(turn[count - 1], last_link, norm, smooth)
+    _, tt, off = _link_form(turn[count - 1], last_link)
     gt = tt * off
     for s in range(count - 1, -1, -1):
         ahead_x, ahead_y = place[s + 1, 0] - place[s, 0], place[s + 1, 1] - place[s, 1]
@@ -125,7 +121,7 @@ def _value_pass(turn, place, link, last_link, first, share, target, weight, kind
         if np.isinf(link[s]):
             gains[s, 0], gains[s, 1], gains[s, 2], gains[s, 3] = 0.0, 0.0, 1.0, 0.0
             continue
-        _, k, off = _link_form(turn[s] - (turn[s - 1] if s > 0 else 0.0), link[s], norm, smooth)
+        _, k, off = _link_form(turn[s] - (turn[s - 1] if s > 0 else 0.0), link[s])
         pull = k * off
         force, rest = gt + pull, tt + damping * (tt + k) + TINY
         whole = k + rest
@@ -152,8 +148,8 @@ def _walk(turn, place, step, gains, share, shift, new_turn, new_place):
 
 
 RELAXED_PASSES = 3
-RELAXED_M, RELAXED_TURN = 0.3, 0.02
-"""Smoothing of distances (m) and of turns from step to step (rad) in the relaxation."""
+RELAXED_M = 0.3
+"""Smoothing of distances (m) in the relaxation."""
 
 
 def bend_banded(
@@ -163,7 +159,7 @@ def bend_banded(
     smooth_end: float = 1e-5,
     tolerance: float = 1e-6,
 ) -> BentPath:
-    """Minimise eq. 5.2 by iteratively reweighted least squares with a decreasing smoothing of norms (m, rad), until the
+    """Minimise eq. 5.2 by iteratively reweighted least squares with a decreasing smoothing of norms (m), until the
     relative decrease of the energy is below `tolerance` and the smoothing has reached its end."""
     path = _Path(problem)
     path.begin()
@@ -192,7 +188,7 @@ class _Path:
         settings, steps = problem.settings, len(problem.leader)
         self.free = settings.free_start
         self.step = np.ascontiguousarray(problem.step.numpy())
-        seconds = problem.link_s.numpy() if settings.norm == "square" else np.ones(steps + 1)
+        seconds = problem.link_s.numpy()
         ends = settings.rigidity * settings.clamped_ends / seconds[[0, -1]]
         leads = problem.leader.numpy() == np.arange(steps)
         self.link = np.where(leads, settings.rigidity / seconds[:-1], np.inf)
@@ -205,7 +201,7 @@ class _Path:
             problem.control_weights.numpy(),
         )
         loss = settings.loss
-        self.kinds = (NORMS.index(settings.norm), LOSSES.index(loss.kind), float(loss.delta))
+        self.kinds = (LOSSES.index(loss.kind), float(loss.delta))
         self.fixed = (self.link, self.last_link, *self.controls, self.kinds)
         self.turn, self.place = np.zeros(steps), (problem.path - problem.path[0]).numpy().copy()
         self.new_turn, self.new_place = np.empty_like(self.turn), np.empty_like(self.place)
@@ -226,14 +222,12 @@ class _Path:
         first, share, target, weight = self.controls
         complex_target = target[:, 0] + 1j * target[:, 1]
         step = self.step[:, 0] + 1j * self.step[:, 1]
-        soft = 1.0 if self.kinds[0] == NORMS.index("square") else 0.5 / RELAXED_TURN
         place, z = np.zeros(len(step) + 1, dtype=complex), np.empty(len(step), dtype=complex)
         at = np.repeat(np.arange(len(step)), np.diff(first))
         distance = np.zeros(len(weight))
         for _ in range(RELAXED_PASSES):
             controls = first, share, complex_target, weight, distance
-            links = soft * self.link, soft * self.last_link
-            _stretch_freely(step, *links, *controls, *self.kinds[1:], self.free, place, z)
+            _stretch_freely(step, self.link, self.last_link, *controls, *self.kinds, self.free, place, z)
             distance = abs(place[at] + share * (place[at + 1] - place[at]) - complex_target)
         self.gains[:] = 0.0
         turn = np.angle(z * np.conj(np.concatenate([z[:1], z[:-1]]))).cumsum() + np.angle(z[0])

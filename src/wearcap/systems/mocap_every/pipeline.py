@@ -23,7 +23,6 @@ from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.runtime.windows import FinalPoses, over_path
 from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
 from wearcap.sensors.watches import FILTER, watch_gaps, watches_at
-from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.visual_cues import VisualCues
@@ -38,13 +37,11 @@ FLOORS = ("follow", "update", "points", "fixed")
 
 @dataclass(frozen=True, eq=False)
 class CapturedWithFloor:
-    """Motion of one recording, with the floor and the edits that it came from."""
+    """Motion of one recording, with the floor that it came from."""
 
     motion: Motion
     floor: FloorTrack
     """Floor height that conditioned the estimator."""
-    edits: list[LatentSolution]
-    """Solutions of the editing by visual cues, one per batch of windows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +153,9 @@ class MocapEvery(LearnedSystem):
         measured = Measured.of(path.T_world_head, whole.floor_height, hands)
         motion = refined_over(self.refinement, motion, measured, path, self.fps, self.anchor)
         # 6. edit the motion within the manifold to fit the visual cues
-        edits: list[LatentSolution] = []
         if self.cues is not None:
-            motion, edits = self.cues.edit(motion, recording, path.T_world_head)
-        return CapturedWithFloor(motion, FloorTrack(path.timestamps, whole.floor_height), edits)
+            motion, _ = self.cues.edit(motion, recording, path.T_world_head)
+        return CapturedWithFloor(motion, FloorTrack(path.timestamps, whole.floor_height))
 
     def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
         """All metrics in the world, without anchoring or alignment (MocapEvery §4.1)."""

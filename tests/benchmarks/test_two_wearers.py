@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from benchmarks.tables import two_wearers
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearsim.recordings import two_wearers
 from wearsim.recordings.simulate import SimulationConfig
 
 simulate_two_wearers = two_wearers.simulate_two_wearers

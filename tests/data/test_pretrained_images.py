@@ -10,8 +10,9 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
+from data_prep.embeddings import ImageEncoder
+from data_prep.pretrained_images import Clip, DinoV2
 from wearcap.errors import WearcapError
-from wearcap.models.image_encoder import Clip, DinoV2, ImageEncoder
 
 VARIABLES = ("HF_HOME", "HF_HUB_CACHE", "WEARCAP_CLIP_WEIGHTS", "WEARCAP_DINOV2_WEIGHTS")
 

@@ -6,9 +6,9 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
+from data_prep.keypoint_detectors import MODEL_VARIABLE, Detector, MediaPipeHands, _Hand, wearers_hands
 from wearcap.body.hands import FINGER_NAMES, HAND_JOINTS
 from wearcap.errors import WearcapError
-from wearcap.localization.keypoints import MODEL_VARIABLE, Detector, MediaPipeHands, _Hand, wearers_hands
 
 
 def mark(x: float, y: float) -> SimpleNamespace:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from data_prep.keypoint_detectors import Detector, Keypoint, RecordedDetections
+from data_prep.keypoint_flow import FlowSettings, KeypointFlow, tracked_cues
 from wearcap.errors import WearcapError
-from wearcap.localization.keypoint_flow import FlowSettings, KeypointFlow, tracked_cues
-from wearcap.localization.keypoints import Detector, Keypoint, RecordedDetections
 from wearcap.recording import Cue
 
 HEIGHT, WIDTH, SIDE = 240, 320, 61

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from data_prep import aria_vrs
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.devices import aria_vrs
 from wearcap.io.devices.aria_mps import nominal_T_aria_cpf
 from wearcap.io.formats.video import read_frames
 

@@ -16,8 +16,9 @@ import torch
 from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
 
+from data_prep.keypoint_detectors import Detector, Keypoint
 from wearcap.errors import WearcapError
-from wearcap.localization.keypoints import Detector, Keypoint
+from wearcap.localization.landmark_tracking import flow_there_and_back
 from wearcap.recording.recording import Cue
 
 APART_AT_MOST = 4.0
@@ -184,25 +185,6 @@ def _followed(track: _Track, before: np.ndarray, after: np.ndarray, settings: Fl
         good = found & (off_px <= settings.return_px) & same
         pixels[rows[good]] = end[good]
     return replace(track, pixels=pixels, age=track.age + 1)
-
-
-def flow_there_and_back(
-    before: np.ndarray,
-    after: np.ndarray,
-    start: Float32[np.ndarray, "point 2"],
-    window_px: int,
-    levels: int,
-    guess: Float32[np.ndarray, "point 2"] | None = None,
-) -> tuple[Float32[np.ndarray, "point 2"], Float32[np.ndarray, "point"], Bool[np.ndarray, "point"]]:
-    """Points' places in the next picture by optical flow (from a guess of them, if any), how far (px) from their start the
-    flow back takes them, and which are found both ways, within the picture."""
-    options = {"winSize": (window_px, window_px), "maxLevel": levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-    first = np.array(start if guess is None else guess)
-    end, there, _ = cv2.calcOpticalFlowPyrLK(before, after, start, first, **options)  # type: ignore[call-overload]
-    first = np.array(end if guess is None else start)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, first, **options)  # type: ignore[call-overload]
-    inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
-    return end, np.linalg.norm(back - start, axis=-1), (there[:, 0] == 1) & (again[:, 0] == 1) & inside
 
 
 def _patches(
