@@ -38,7 +38,10 @@ def run(config: DictConfig) -> float:
 
     Raises WearcapError for what cannot be adapted, and where nothing was gained: then nothing is written.
     """
-    system, output = _system_of(config.checkpoint), Path(config.output)
+    (training, system), output = training_of(config.checkpoint), Path(config.output)
+    if system is None or not issubclass(system, LearnedSystem):
+        expected = "a checkpoint of HMD², MocapEvery or ECHO"
+        raise WearcapError(f"{training} is not adapted to wearers", config.checkpoint, expected)
     if output.suffix != ".safetensors":
         raise WearcapError(f"output={output}", expected="NAME.safetensors")
     paths = config.recordings if isinstance(config.recordings, ListConfig) else [config.recordings]
@@ -46,12 +49,10 @@ def run(config: DictConfig) -> float:
     require_one_wearer(recordings, config.least_s, config.similar)
     folder = Path(config.paths.run)
     store = _data_set(folder / WEARER, *parted(recordings, config.held_out))
-    training = _training(config, system, store, folder)
-    others = [name for name, source in training.data.sources.items() if source and name != WEARER]
-    show(
-        f"the wearer's windows are mixed with those of: {', '.join(others) or 'nothing, for no data set of it is here'}"
-    )
-    train(training)
+    composed = _training(config, system, store, folder)
+    others = [name for name, source in composed.data.sources.items() if source and name != WEARER]
+    show(f"the wearer's windows are mixed with those of: {', '.join(others) or 'nothing, for none of it is here'}")
+    train(composed)
     pipeline = compose("evaluate", [f"pipeline={system.pipeline}"]).pipeline
     trained, errors = last_checkpoint(folder), dict[Path, float]()
     before, after = (read_checkpoint(each)[1] for each in (config.checkpoint, trained))
@@ -76,14 +77,6 @@ def between(before: dict[str, Tensor], after: dict[str, Tensor], share: float) -
     """Weights that lie a share of the way from one training's to those that it went on to (Wortsman et al. 2022)."""
     both = [name for name, value in after.items() if name in before and value.is_floating_point()]
     return {name: torch.lerp(before[name], after[name], share) for name in both}
-
-
-def _system_of(checkpoint: str) -> type[System]:
-    training, system = training_of(checkpoint)
-    if system is None or not issubclass(system, LearnedSystem) or system.pipeline is None:
-        expected = "a checkpoint of HMD², MocapEvery or ECHO"
-        raise WearcapError(f"{training} is not adapted to wearers", checkpoint, expected)
-    return system
 
 
 def true_recordings(path: Path, how: Conventions) -> list[Recording]:
@@ -154,8 +147,7 @@ def _training(config: DictConfig, system: type[System], store: RecordingStore, f
     base: Any = compose("train", [str(system.experiment), "callbacks=averaged"])
     OmegaConf.set_struct(base, False)
     base.name = about.get("name", base.name)
-    if "dataset" in own:  # a run's own checkpoint: what it was trained on, and how
-        base.data = own
+    base.data = own if "dataset" in own else base.data  # of a run's own checkpoint: what it was trained on, and how
     changes: Any = OmegaConf.to_container(config.train, resolve=True)
     base.optimizer = changes.pop("optimizer")  # in place of the training's own, which may be of another kind
     base.merge_with(changes)
@@ -166,11 +158,10 @@ def _training(config: DictConfig, system: type[System], store: RecordingStore, f
     content: Any = OmegaConf.to_container(data.dataset.content, resolve=True)
     if "conditions" in content:
         # In the model's order; embeddings, which no recording needs to have, as it takes them
-        windows, given = content["conditions"], model["conditions"]
-        sized = {
-            name: {key: each[key] for key in ("encoder", "size") if "size" in each} for name, each in given.items()
-        }
-        content["conditions"] = {name: windows[name] | settings for name, settings in sized.items()}
+        windows = content["conditions"]
+        content["conditions"] = {name: windows[name] for name in model["conditions"]}
+        for name, each in model["conditions"].items():
+            windows[name] |= {key: each[key] for key in ("encoder", "size") if "size" in each}
         base.surroundings = {}
     data.dataset.content = content
     # The last step, too, is followed by a validation, which leaves a checkpoint.
