@@ -96,7 +96,7 @@ def test_the_last_part_is_held_out():
 
 def test_a_suits_take_is_true_motion(tmp_path):
     path = tmp_path / "take.mvnx"
-    path.write_text(mvnx(swaying_motion(90)))
+    path.write_text(mvnx(replace(swaying_motion(90), contact_prob=torch.ones(90, 4))))
     [found] = adapt.true_recordings(path, DETECTED)
     assert found.head is not None
     assert found.motion is not None
