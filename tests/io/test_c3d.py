@@ -56,11 +56,11 @@ def test_a_person_goes_through_every_door(tmp_path, capsys):
     assert "2 analog channels" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
-def test_markers_that_no_body_fits_are_refused(tmp_path):
+def test_markers_that_are_never_seen_are_not_there(tmp_path):
     names = markers_of(squats(person(), 0.1)).names
     unseen = torch.full((5, len(names), 3), torch.nan, dtype=torch.float64)
     path = write_c3d(Markers(torch.arange(5).double() / 100, names, unseen), tmp_path / "a.c3d")
-    with pytest.raises(WearcapError, match="no body fits these markers"):
+    with pytest.raises(WearcapError, match="too few markers of the pelvis"):
         wearcap.read(path)
 
 

@@ -131,7 +131,10 @@ def fit_body(trials: Sequence[Markers]) -> MarkerBody:
 
     Raises WearcapError naming the missing markers of a part of the body of which less than three are seen.
     """
-    there = {plug_in_gait(name) for trial in trials for name in trial.names} & set(MARKERS)
+    there = set[str]()
+    for trial in trials:
+        seen = trial.t_world_marker.isfinite().all(-1).any(0).tolist()
+        there |= {plug_in_gait(name) for name, is_seen in zip(trial.names, seen) if is_seen} & set(MARKERS)
     for part, among in _NEEDED.items():
         lacking = [name for name in among.split() if name not in there]
         if len(among.split()) - len(lacking) < 3:

@@ -150,7 +150,8 @@ def _load_markers(path: Path, how: Conventions) -> Loaded:
     """Optical markers as the motion of a body that is fitted to this trial alone."""
     markers = read_markers(path, how)
     # Markers that are never seen at a time, or kilometres apart, leave equations without a solution.
-    with placed(path), understood("no body fits these markers", path, "a person", "Check the unit.", RuntimeError):
+    unsolved = (RuntimeError, ValueError, LookupError)
+    with placed(path), understood("no body fits these markers", path, "a person", "Check the unit.", unsolved):
         body = fit_body([markers])
         motion, distance = fit_motion(body, markers)
     fitted, check = f"{len(body.names)} markers, {1000 * rms_m(distance):.0f} mm (rms) from the body", Check("markers")
