@@ -74,7 +74,6 @@ def examine_recording(recording: Recording) -> list[Finding]:
         findings += [check_hand(joint, hand, head) for joint, hand in recording.tracked.items() if len(hand)]
         if recording.floor is not None and len(recording.floor.timestamps):
             findings += check_carried(head, recording.floor)
-    findings += [check_fingers(side, hand, head) for side, hand in recording.fingers.items()]
     if head is not None and "head" in recording.cues:
         findings.append(check_head_cue(head, recording.cues["head"]))
     for name, imu in recording.imu.items():
@@ -90,7 +89,7 @@ def examine_recording(recording: Recording) -> list[Finding]:
         findings += check_points(recording.points, head)
     if recording.camera is not None:
         findings += check_camera(recording.camera)
-    findings += (claps := check_claps(recording))
+    findings += [*(claps := check_claps(recording)), *(check_fingers(*of, head) for of in recording.fingers.items())]
     if recording.localization is not None and "localization" in usable:
         findings += check_localization(recording.localization, bodies.get("suit", body), claps)
     return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
