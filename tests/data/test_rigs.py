@@ -1,5 +1,7 @@
 """Motion on characters: bones point as the motion's do, feet stand on the floor, and the file stays what it was."""
 
+import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -189,8 +191,39 @@ def test_feet_slide_no_more_than_the_motions(tmp_path):
         assert slide < of_motion + 0.01
 
 
+def split(path) -> tuple[dict, bytes]:
+    """The JSON of a .glb file, and what follows it."""
+    data = path.read_bytes()
+    (size,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + size]), data[20 + size :]
+
+
+def join(path, document: dict, rest: bytes) -> None:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
+    path.write_bytes(head + text + rest)
+
+
 def test_what_is_missing_is_named(tmp_path):
     rig_files.write(tmp_path / "own.glb", vrm=False)
+    document, binary = split(tmp_path / "own.glb")
+    hips = document["nodes"][0]
+    for removed, words in (([11], "left leg of skeleton .* is not recognised"), ([4], "different trees")):
+        changed = {**document, "nodes": [dict(node) for node in document["nodes"]]}
+        if removed == [11]:
+            changed["nodes"][0] = {**hips, "children": [child for child in hips["children"] if child not in removed]}
+            for node in changed["nodes"]:
+                node["name"] = node["name"].replace("LeftLeg", "Cape")
+        else:
+            changed["nodes"][3] = {
+                **changed["nodes"][3],
+                "children": [c for c in changed["nodes"][3]["children"] if c != 4],
+            }
+            changed["scenes"] = [{"nodes": [*document["scenes"][0]["nodes"], 4]}]
+        join(tmp_path / "broken.glb", changed, binary)
+        with pytest.raises(WearcapError, match=words):
+            read_rig(tmp_path / "broken.glb")
     for path, words in ((tmp_path / "x.fbx", ".vrm"), (tmp_path / "no.glb", "no such")):
         with pytest.raises(WearcapError, match=words):
             read_rig(path)

@@ -15,7 +15,7 @@ from wearcap.body.character import onto_character
 from wearcap.body.foreign_tree import foreign_tree, kept_joints, standing_rotation, straightness
 from wearcap.body.joint_matching import common_ancestor
 from wearcap.body.skeleton import FOOT_PATCHES, SIDES, Skeleton, ancestors
-from wearcap.boundary.opening import placed
+from wearcap.boundary.opening import placed, understood
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.bvh import BvhContent, read_bvh_content, write_bvh_like
@@ -104,8 +104,12 @@ def _rig(
     still: tuple[Float[Tensor, "joint 3 3"], Float[Tensor, "joint 3"]],
 ) -> Rig:
     """The rig of a file's joints; `lowest` is the height of its mesh, `still` what its joints keep that are not driven."""
-    with placed(path):
+    apart = "its head, arms and legs hang on different trees of bones"
+    with placed(path), understood(apart, path, "one skeleton", errors=StopIteration):
         take, found = with_toes(take, find_body(take, Mapping(), path)[0])
+        driven, _ = kept_joints(take.parents, found)
+        ends = [found.head, *(triple[2] for triple in found.limb.values())]
+        carrier = common_ancestor(take.parents, driven[0], *ends)
     t, R_bind = take.rest, torch.eye(3, dtype=take.rest.dtype).repeat(len(take.rest), 1, 1)
     if isinstance(file, GlbRig):
         R_bind = file.R_bind
@@ -121,9 +125,6 @@ def _rig(
     places = t @ R_ours_bind.T
     eye = torch.eye(3, dtype=places.dtype)
     tree = foreign_tree(path.name, take.parents, eye.repeat(1, len(places), 1, 1), places[None], found, eye)
-    driven, _ = kept_joints(take.parents, found)
-    ends = [found.head, *(triple[2] for triple in found.limb.values())]
-    carrier = common_ancestor(take.parents, driven[0], *ends)
     ankles = [found.limb[f"{side}_leg"][2] for side in SIDES]
     hips = [found.limb[f"{side}_leg"][0] for side in SIDES]
     height = (places[hips, 2] - places[ankles, 2]).mean().item()
