@@ -73,5 +73,5 @@ def test_every_object_of_both_data_sets_has_a_class():
 def test_an_unknown_name_is_refused_with_those_that_are_known():
     with pytest.raises(WearcapError, match="no class for the object 'boxlarg'.*chairblack.*Did you mean 'boxlarge'"):
         object_class("boxlarg")
-    with pytest.raises(WearcapError, match="no class for the object 'spaceship'.*one of backpack.*objects.py"):
+    with pytest.raises(WearcapError, match="no class for the object 'spaceship'.*one of backpack.*one_object.py"):
         object_class("spaceship")
