@@ -2,8 +2,9 @@
 
 blender -b --python integrations/blender/to_fbx.py -- motion.glb motion.fbx
 
-Takes .glb or .bvh; writes armature, body and animation with one key per frame, at the motion's own rate. Without Blender,
-an interpreter with `pip install bpy` runs it: `python to_fbx.py motion.glb motion.fbx`.
+Writes armature, body and animation with one key per frame, at the motion's own rate. Of a .bvh file Blender's importer leaves
+out the first frame and has no body, so only .glb is taken. Without Blender, an interpreter with `pip install bpy` runs it:
+`python to_fbx.py motion.glb motion.fbx`.
 """
 
 import json
@@ -26,16 +27,12 @@ def rate_of(glb: str) -> float:
 
 def convert(source: str, target: str) -> None:
     """Raises SystemExit for a file of another kind."""
+    if Path(source).suffix.lower() != ".glb":
+        raise SystemExit(f"{source}: no motion of a kind that is read. Expected a .glb file.")
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene, ending = bpy.context.scene, Path(source).suffix.lower()
-    if ending == ".glb":
-        rate = rate_of(source)
-        scene.render.fps, scene.render.fps_base = max(1, round(rate)), max(1, round(rate)) / rate
-        bpy.ops.import_scene.gltf(filepath=source, disable_bone_shape=True)
-    elif ending == ".bvh":
-        bpy.ops.import_anim.bvh(filepath=source, update_scene_fps=True, global_scale=0.01)
-    else:
-        raise SystemExit(f"{source}: no motion of a kind that is read. Expected a .glb or .bvh file.")
+    scene, rate = bpy.context.scene, rate_of(source)
+    scene.render.fps, scene.render.fps_base = max(1, round(rate)), max(1, round(rate)) / rate
+    bpy.ops.import_scene.gltf(filepath=source, disable_bone_shape=True)
     spans = [action.frame_range for action in bpy.data.actions]
     scene.frame_start, scene.frame_end = (round(pick(edge)) for pick, edge in zip((min, max), zip(*spans)))
     bpy.ops.export_scene.fbx(
