@@ -418,16 +418,7 @@ CLOCKS = {
 
 def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
     """What docs/results/echo.md says."""
-    objects, people = pages.rows_of(trees, OBJECTS_1), pages.rows_of(trees, CMU)
     online = pages.figures_of(speed, "echo_online_small_fps")
-    placed, unknown = (pages.mean(objects[row]["center_cm"], 0) for row in ("ours", "ours, hinges and rails unknown"))
-    joints, *tracked = (
-        {"mean": rows[row]["mpjpe_mm"]["mean"] / 10}
-        for rows, row in (
-            (objects, "ours"),
-            *((people, f"ours{tracking}") for tracking in ("", ", typical tracking", ", poor tracking")),
-        )
-    )
     return pages.Page(
         title="[ECHO](../echo.md): figures",
         headline=pages.Grid(
@@ -446,8 +437,6 @@ def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
         limits=echo_limits.limits(trees, OBJECTS_1, CMU, HDM05),
         full=[grid for tree in trees.values() for grid in pages.score_grids(tree, LABELS)],
         commands=pages.commands(trees),
-        measured=f"joints {pages.ranged([joints])} cm and objects {placed} cm off, exactly tracked ({unknown} with unknown hinges); real motion (CMU) "
-        f"{pages.ranged(tracked)}, with exact to poor tracking",
         speed=f"{pages.times(online)} online, head and wrists tracked, active object given ({pages.machines(online)})"
         if online
         else "",

@@ -417,7 +417,6 @@ def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
         limits=(*_limits(simulated, real, strangers), _codes(), *_refined(people)),
         full=[*pages.score_grids(people, _labels(), "repetitions"), *_grids(trees)],
         commands=found,
-        measured=_measured(simulated, real),
         speed=f"{pages.times(online)} online, head's path and points given ({pages.machines(online)})"
         if online
         else "",
@@ -444,16 +443,6 @@ COMPARED = (
     *(("simulated", metric) for metric in ("mpjpe_cm", "fid")),
 )
 """Columns of the page's table."""
-
-
-def _measured(simulated: dict[str, pages.Tree], real: dict[str, pages.Tree]) -> str:
-    """README's cell: ranges over sensors, beside the lookup of the nearest window."""
-    errors = [pages.ranged(rows[name]["mpjpe_cm"] for name in SENSING if name in rows) for rows in (simulated, real)]
-    looked_up = [pages.mean(rows["nearest window"]["mpjpe_cm"]) for rows in (simulated, real)]
-    return (
-        f"joints {errors[0]} cm off (the nearest training window: {looked_up[0]}); real motion (CMU) {errors[1]} ({looked_up[1]}); both with "
-        "ideal to poor sensors"
-    )
 
 
 def _limits(

@@ -227,9 +227,7 @@ CLOCKS = {
 
 def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
     """What docs/results/mocap_every.md says."""
-    body, floor = pages.rows_of(trees, CMU), pages.rows_of(trees, HILLS)
     online = pages.figures_of(speed, "mocap_every_online_fps")
-    hills = pages.ranged(_over_sensors(floor, "floor follow"))
     return pages.Page(
         title="[MocapEvery](../mocap_every.md): figures",
         headline=pages.Grid(
@@ -248,7 +246,6 @@ def page(trees: pages.Trees, speed: dict[str, list[pages.Tree]]) -> pages.Page:
         limits=_limits(trees),
         full=[grid for tree in trees.values() for grid in pages.score_grids(tree, LABELS, "trainings or runs")],
         commands=pages.commands(trees),
-        measured=f"hillsides {hills} cm; real motion (CMU) {pages.ranged(_over_sensors(body, 'ours'))}; both with ideal to poor sensors",
         speed=f"{pages.times(online)} online, head poses given ({pages.machines(online)})" if online else "",
         clocks=CLOCKS,
         pictures=(

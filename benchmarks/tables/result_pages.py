@@ -70,8 +70,8 @@ class Page:
     """Every table of the JSON, for `--all`."""
     commands: tuple[str, ...]
     """Lines that make the tables."""
-    measured: str
-    """README's cell "measured here"."""
+    measured: str = ""
+    """README's cell "measured here"; empty: it stays as it is, of the card of today's checkpoint."""
     speed: str = ""
     """README's cell "speed"; empty: it stays as it is."""
     clocks: Mapping[str, str] = field(default_factory=dict)
@@ -476,7 +476,7 @@ def with_readme(readme: str, system: str, page: Page) -> str:
     for place, line in enumerate(lines):
         if line.startswith("| [") and f"](docs/{system}.md)" in line.split(" | ")[0]:
             cells = line.strip().strip("|").strip().split(" | ")
-            cells[3:] = [page.measured, page.speed or cells[4]]
+            cells[3:] = [page.measured or cells[3], page.speed or cells[4]]
             lines[place] = "| " + " | ".join(cells) + " |\n"
             return "".join(lines)
     raise WearcapError(f"no row of {system!r}", where="README.md", expected=f"a row that links docs/{system}.md")

@@ -251,7 +251,7 @@ def test_the_page_is_what_its_json_gives(system):
     page = page_of(system)
     assert all((ROOT / "docs" / name).is_file() for name, _ in page.pictures)
     assert render(system, page, read_speed()) == (RESULTS / f"{system}.md").read_text(encoding="utf-8")
-    if page.measured:
+    if page.measured or page.speed:
         readme = (ROOT / "README.md").read_text(encoding="utf-8")
         assert with_readme(readme, system, page) == readme
 
@@ -298,7 +298,7 @@ def test_all_of_the_documentation_is_read_in_an_evening():
     readme = len((ROOT / "README.md").read_text(encoding="utf-8").split())
     pages = sum(len(path.read_text(encoding="utf-8").split()) for path in (ROOT / "docs").rglob("*.md"))
     assert readme <= 700
-    assert readme + pages <= 30_000
+    assert readme + pages <= 33_000
 
 
 def hps_run(ours_cm: float) -> dict:

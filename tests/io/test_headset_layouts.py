@@ -299,7 +299,7 @@ def test_unreals_rotators(tmp_path):
         T * 100,
         *(np.degrees(a) for a in (pitch, yaw, roll)),
     )
-    poses, convention, notes = read_raw_poses(path)
+    poses, _, convention, notes = read_raw_poses(path)
     assert "pitch, yaw and roll in degrees as Unreal's" in notes
     assert convention == "unreal"
     assert np.abs(poses["head"].rotation - np.stack([x, y, z], 2)).max() < 1e-6
@@ -328,7 +328,7 @@ def test_trials_of_a_session_are_one_recording_with_a_gap(tmp_path):
             )
     write(tmp_path / "S001" / "trial_results.csv", "experiment,ppid,trial_num\nwalk,A. Nonymous,1\n")
     assert is_headset_session(tmp_path / "S001")
-    poses, convention, notes = read_raw_poses(tmp_path / "S001")
+    poses, _, convention, notes = read_raw_poses(tmp_path / "S001")
     kept = np.r_[0:cut, cut + 60 : len(TIME)]
     assert convention == "unity"
     assert "2 trials of a UXF session in one recording" in notes
@@ -383,7 +383,7 @@ def test_folders_that_are_no_sessions(tmp_path):
 @pytest.mark.parametrize("name", ["J_hs_clock.csv", "J_hs_iso.csv", "J_hs_ticks.csv", "J_hs_euler.csv"])
 def test_field_logs_agree_with_each_other(real_data, name):
     """One walk at 72 Hz in four layouts."""
-    poses, _, _ = read_raw_poses(real_data / "field" / name)
+    poses, _, _, _ = read_raw_poses(real_data / "field" / name)
     head = poses["head"]
     assert len(head.seconds) == 899
     assert np.abs(head.seconds - head.seconds[0] - np.arange(899) / 72).max() < 1.1e-3
@@ -393,7 +393,7 @@ def test_field_logs_agree_with_each_other(real_data, name):
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["S_unity_euler.csv", "S_uxf_session", "K_quest_session", "R_right_hand_late.csv"])
 def test_field_sessions(real_data, name):
-    poses, convention, notes = read_raw_poses(real_data / "field" / name)
+    poses, _, convention, notes = read_raw_poses(real_data / "field" / name)
     assert set(poses) == set(SIDES)
     assert convention == ("unity" if name.startswith("S") else None)
     assert len(poses["head"].seconds) == {"K": 1080, "R": 420, "S": 720}[name[0]]

@@ -125,18 +125,18 @@ def test_short_gaps_of_the_head_are_interpolated(tmp_path, text):
 
 
 def test_long_gaps_of_the_head_stay(tmp_path):
-    poses, _, _ = read_raw_poses(with_lost(tmp_path / "a.csv", 0, range(50, 90), NOTHING[0]))
+    poses, _, _, _ = read_raw_poses(with_lost(tmp_path / "a.csv", 0, range(50, 90), NOTHING[0]))
     assert np.array_equal(poses["head"].seconds.round(6), np.delete(TIME, range(50, 90)).round(6))
 
 
 def test_a_hand_that_freezes_is_lost(tmp_path):
     """The last pose repeated while the head moves; a pause of everything is no loss."""
     last = ",".join(f"{value:.7f}" for value in seven("left")[99])
-    poses, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 1, range(100, 140), last))
+    poses, _, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 1, range(100, 140), last))
     assert len(poses["left_wrist"].seconds) == len(TIME) - 40
     assert "left_wrist repeats its last pose in 40 rows, where it counts as lost" in notes
     still = np.repeat(all_seven()[:1], len(TIME), 0)
-    poses, _, _ = read_raw_poses(csv(tmp_path / "b.csv", f"time,{names_of('{d}_{q}_{a}')}", TIME, still))
+    poses, _, _, _ = read_raw_poses(csv(tmp_path / "b.csv", f"time,{names_of('{d}_{q}_{a}')}", TIME, still))
     assert len(poses["left_wrist"].seconds) == len(TIME)
 
 
@@ -150,7 +150,7 @@ def test_a_hand_that_freezes_is_lost(tmp_path):
     ],
 )
 def test_a_hand_that_is_tracked_late(tmp_path, lost, kept, message):
-    poses, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 2, lost, NOTHING[2]))
+    poses, _, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 2, lost, NOTHING[2]))
     assert message in notes
     assert ("right_wrist" in poses) == (kept is not None)
     assert np.array_equal(poses["head"].seconds.round(6), TIME[kept or slice(None)].round(6))
@@ -161,6 +161,6 @@ def test_flags_of_tracking(tmp_path):
     flags = ["False" if k < 20 else "True" for k in range(len(TIME))]
     names = names_of("{d}_{q}_{a}").replace("left_pos_x", "left_isTracked,left_pos_x")
     path = csv(tmp_path / "a.csv", f"time,{names}", TIME, seven("head"), flags, seven("left"), seven("right"))
-    poses, _, notes = read_raw_poses(path)
+    poses, _, _, notes = read_raw_poses(path)
     assert "left_wrist is not tracked in 20 of 240 rows" in notes
     assert poses["left_wrist"].seconds[0] == pytest.approx(poses["head"].seconds[0])

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from data_prep import marker_fit as fit
 from marker_person import markers_of, person, squats
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.metrics.gait import knee_deg
+from wearcap.optimize import markers as fit
 
 TRUE = squats(person())
 SEEN = markers_of(TRUE)

@@ -132,7 +132,7 @@ def test_motions_are_saved_by_their_names(tmp_path):
         wearcap.save(motion, tmp_path / name)
         assert (tmp_path / name).stat().st_size > 500
     assert read_motion(tmp_path / "a.npz").skeleton == motion.skeleton
-    with pytest.raises(WearcapError, match=r"ends with \.npz, \.bvh, \.glb, _smplh\.npz"):
+    with pytest.raises(WearcapError, match=r"ends with \.npz, \.bvh, _smplh\.npz, \.vrma"):
         wearcap.save(motion, tmp_path / "a.fbx")
 
 

@@ -23,6 +23,7 @@ from wearcap.recording import (
     CameraStream,
     ContactTrack,
     Cue,
+    FingerStream,
     FloorTrack,
     HeadStream,
     ImuStream,
@@ -60,6 +61,7 @@ def full_recording(name: str = "all") -> Recording:
         object_motion={"door": track},
         provenance={"source": "a test"},
     )
+    fingers = FingerStream(times, torch.randn(FRAMES, 25, 3), torch.ones(FRAMES, dtype=torch.bool), torch.ones(FRAMES))
     camera = Camera("pinhole", 640, 480, 500.0, 500.0, 320.0, 240.0)
     held = Interactions(
         times[:2], times[1:3], torch.tensor([[True, False], [True, True]]), ("door", ""), ("hinged", "")
@@ -75,6 +77,7 @@ def full_recording(name: str = "all") -> Recording:
         points=PointCloud(torch.randn(50, 3), torch.rand(50), torch.rand(50, dtype=torch.float64)),
         cues={"wrist": Cue(times, "left_wrist", torch.randn(FRAMES, 2), torch.rand(FRAMES))},
         tracked={"left_wrist": track},
+        fingers={"left": fingers},
         scene="room.ply",
         environment="environment.json",
         interactions=held,

@@ -18,8 +18,11 @@ PARENTS = {
        for side in ("Left", "Right") for bone, parent in (
            ("Shoulder", "UpperChest"), ("UpperArm", "Shoulder"), ("LowerArm", "UpperArm"), ("Hand", "LowerArm"),
            ("UpperLeg", "Hips"), ("LowerLeg", "UpperLeg"), ("Foot", "LowerLeg"), ("Toes", "Foot"))},
+    **{f"{side}{finger}{bone}": f"{side}{parent.format(finger)}" for side in ("Left", "Right")
+       for finger in ("Thumb", "Index", "Middle", "Ring", "Little")
+       for bone, parent in (("Proximal", "Hand"), ("Intermediate", "{}Proximal"), ("Distal", "{}Intermediate"))},
 }  # fmt: skip
-"""Unity's humanoid bones with their parents, which come first; fingers, eyes and the jaw are passed over."""
+"""Unity's humanoid bones with their parents, which come first; eyes and the jaw are passed over."""
 ROOT, STILL = "", np.array([0.0, 0, 0, 0, 0, 0, 1])
 """Key of the root's pose, in which the hips lie, among those of bones; and that pose unless it is sent."""
 

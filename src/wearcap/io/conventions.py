@@ -3,7 +3,6 @@
 from dataclasses import dataclass, fields
 
 from wearcap.errors import WearcapError, require_choice
-from wearcap.io.devices.hand_seats import SEATS
 
 UNITS_M = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "foot": 0.3048}
 """Metres per unit of length, by name."""
@@ -12,7 +11,7 @@ CHOICES = {
     "up": ("x", "y", "z", "-x", "-y", "-z"),
     "axes": ("camera", "head", "openxr", "steamvr", "unity", "unreal"),
     "quaternion": ("xyzw", "wxyz"),
-    "hands": tuple(SEATS),
+    "hands": ("grip", "aim", "touch", "index", "vive", "wrist", "palm"),
     "time_unit": ("s", "ms", "us", "ns"),
 }
 """What may be stated, beside numbers."""

@@ -106,11 +106,11 @@ class LiveCapture:
         self.opener = Opener(
             lambda wearer: kind.of_wearers(system, [wearer], seed, source),
             kind.devices,
-            {joint: hand_seat(joint, self.known.hands) for joint in kind.optional},
             kind.tracks_wrists,
             kind.takes_objects,
             self._estimation,
             any(source.patient for source in self.sources),
+            {joint: hand_seat(joint, self.known.hands) for joint in kind.optional},
         )
         self.inbox = Inbox()
         self.wearers = Recent(MAX_WEARERS, self._new_wearer, self._is_captured)

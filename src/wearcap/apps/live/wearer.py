@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -59,14 +59,14 @@ class Opener:
     session: Callable[[Wearer], Session]
     devices: tuple[str, ...]
     """Devices that the session needs; the first one's clock times the motion."""
-    hands: dict[str, Seat]
-    """Nominal seats of wrists that the session takes where they come, without a set-up that knows them."""
     tracks_wrists: bool
     takes_objects: bool
     estimation: Callable[[Setup | None, bool], SetupEstimation]
     """(set-up of last time, whether guided) → a new first minute."""
     patient: bool = False
     """Whether a wearer without packets stays: they come in pieces of any length."""
+    hands: Mapping[str, Seat] = field(default_factory=dict)
+    """Nominal seats of wrists that the session takes where they come, without a set-up that knows them."""
 
 
 @dataclass(eq=False)

@@ -67,7 +67,7 @@ def raw_poses(
             raise WearcapError("no two tracked poses of the headset", path, "positions and rotations")
         for side, (found, values) in hands.items() if joint == "head" else ():  # in the same file's rows
             points = found.points(values)[kept]
-            shown = RawPoses(seconds, points[:, 0], np.nan_to_num(points), None, None)
+            shown = RawPoses(seconds, points[:, 0], np.nan_to_num(points), None, ())
             points[_frozen(shown, poses["head"])] = np.nan
             fingers[side] = seconds, points
     check_span(poses["head"].seconds, path, lambda row: f"pose {row + 1} of the head")
