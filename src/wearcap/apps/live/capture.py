@@ -110,7 +110,7 @@ class LiveCapture:
             kind.takes_objects,
             self._estimation,
             any(source.patient for source in self.sources),
-            {joint: hand_seat(joint, self.known.hands) for joint in kind.optional},
+            {joint: hand_seat(joint, self._seen_hands) for joint in kind.optional},
         )
         self.inbox = Inbox()
         self.wearers = Recent(MAX_WEARERS, self._new_wearer, self._is_captured)
@@ -138,6 +138,11 @@ class LiveCapture:
             setup=before,
             guided=guided or known.guided,
         )
+
+    @property
+    def _seen_hands(self) -> str:
+        """What hands that are seen now and then are, which no first minute looks at: wrist joints, unless it is stated."""
+        return "joint" if self.known.hands == "auto" else self.known.hands
 
     # --- running ----------------------------------------------------------------------------------------------------
 
