@@ -41,6 +41,7 @@ import c3d_files  # noqa: E402
 import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
 import marker_person  # noqa: E402
+import rig_files  # noqa: E402
 import short_walk  # noqa: E402
 from data_prep import (  # noqa: E402
     adt,
@@ -74,6 +75,7 @@ from wearcap.io.formats import (  # noqa: E402
     csv_table,
     environment,
     glb,
+    glb_rig,
     hand_detections,
     motion_npz,
     mvnx,
@@ -377,6 +379,7 @@ READERS: dict[str, Reader] = {
     "vertex_contacts": Reader(
         _vertex_contacts, lambda folder: hand_detections.read_vertex_contacts(folder / "p.npz", folder / "s.json")
     ),
+    "glb_rig": made("rig.vrm", lambda path: rig_files.write(path, vrm=True), glb_rig.read_glb_rig),
     "glb": one("a.glb", test_glb.glb(test_glb.content(nodes=NODES)), glb.read_glb),
     "hcontact": Reader(
         lambda folder: test_hcontact.write_set(folder, frames=FRAMES),

@@ -27,6 +27,7 @@ _DAMAGE = (
     ValueError,
     AttributeError,
     MemoryError,
+    UnboundLocalError,  # a parameter block that ends too soon, in the library
 )
 _BLOCK = 512
 
