@@ -219,14 +219,17 @@ def test_sinks_count_the_frames_that_they_really_send(tmp_path: Path):
         for thread in threads:
             thread.start()
         with connect(heard.url) as client:
+            got: list[dict] = []
             for name, pieces in (("anna", 4), ("ben", 6)):
                 for thread in threads:
                     thread.begin(name, motion.skeleton, 60.0)
+                got.append(json.loads(client.recv(10.0)))  # from now on it is one of the clients
+                for thread in threads:
                     for k in range(pieces):
                         bad = thread.sink is files and name == "ben" and k == 2
                         root = motion.t_world_root * (torch.nan if bad else 1.0)
                         thread.take(name, replace(motion, timestamps=motion.timestamps + k / 2, t_world_root=root))
-            got = [json.loads(client.recv(10.0)) for _ in range(2 + 10 * 30)]
+                got += [json.loads(client.recv(10.0)) for _ in range(30 * pieces)]
         for thread in threads:
             thread.close()
     assert sum("time" in message for message in got) == heard.sent == 10 * 30
@@ -423,8 +426,8 @@ def test_clients_of_the_websocket_get_skeleton_and_frames():
     thread.start()
     with connect(sink.url) as client:
         thread.begin("anna", motion.skeleton, 60.0)
+        about = json.loads(client.recv(5.0))  # from now on it is one of the clients
         thread.take("anna", motion)
-        about = json.loads(client.recv(5.0))
         assert about["skeleton"]["joints"] == list(motion.skeleton.joint_names)
         frames = [json.loads(client.recv(5.0)) for _ in range(5)]
     R = matrix_from_quat_wxyz(torch.tensor([frame["rotations_wxyz"] for frame in frames], dtype=torch.float64))
