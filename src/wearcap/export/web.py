@@ -42,6 +42,8 @@ from wearcap.tracking.wrists import UNSEEN_S
 
 VERSION = 1
 """Version of the folder's `network.json`."""
+VERTICES = 2500
+"""Size of the bodies' surfaces."""
 PAGE = Path(__file__).with_name("page")
 MAX_SAMPLE_S = 60.0
 """Longest part (s) of a recording that becomes the folder's sample."""
@@ -96,7 +98,7 @@ def write_page(exports: Exports, folder: str | Path, recording: Recording, libra
         about |= {"sha256": sha256_of(out / "network.onnx"), "outputs": list(graph.inputs)}
         _write_json(out / "network.json", about)
         skeleton = convert(exports.about["skeleton"], SkeletonEntry).skeleton()
-        write_glb(_resting(skeleton), out / "body.glb", anny_body(skeleton))
+        write_glb(_resting(skeleton), out / "body.glb", anny_body(skeleton, vertices=VERTICES))
         _write_sample(recording, skeleton, out)
         _write_json(out / "files.json", _contents(out))
         with explaining_writes(folder):
@@ -193,7 +195,7 @@ def _write_sample(recording: Recording, fallback: Skeleton, out: Path) -> None:
         "skeleton": _offsets(skeleton),
     }
     _write_json(out / "sample.json", sample)
-    body: BodyModel = anny_body(skeleton, recording.shape or None)
+    body: BodyModel = anny_body(skeleton, recording.shape or None, VERTICES)
     write_glb(motion if known and motion is not None else _resting(skeleton), out / "sample.glb", body)
 
 

@@ -155,10 +155,11 @@ class Page {
     if (frame && this.headset.session) this.headset.draw(now, frame);
     else this.#replay(elapsed);
     this.scene.draw();
-    if (now - (this.told ?? 0) > 500) {
-      get("rate").textContent = `${this.frames.length} frames/s`;
-      this.told = now;
-    }
+    this.told ??= now;
+    if (now - this.told < 1000) return;
+    get("rate").textContent = `${this.frames.length} frames/s`;
+    this.scene.adapt(this.frames.length);
+    this.told = now;
   }
 
   #replay(elapsed) {
@@ -172,7 +173,7 @@ class Page {
     bodies.capture.pose(root, quats, deviations);
     if (this.recording.truth) bodies.truth?.play(time - this.recording.truth_start_s);
     const middle = bodies.truth ? bodies.capture.place.lerp(bodies.truth.place, 0.5) : bodies.capture.place;
-    this.scene.track(middle, !this.begun);
+    this.scene.track(middle, this.begun ? elapsed : Infinity);
     this.begun = true;
     if (!this.scrubbing) get("scrub").value = (1000 * (time - clock.start)) / Math.max(clock.end - clock.start, 1e-6);
     get("time").textContent = `${(time - clock.start).toFixed(1)} / ${(clock.end - clock.start).toFixed(1)} s`;

@@ -5,12 +5,16 @@ import { OrbitControls } from "./libraries/three/examples/jsm/controls/OrbitCont
 import { GLTFLoader } from "./libraries/three/examples/jsm/loaders/GLTFLoader.js";
 
 const SKY = 0xdfe5ec;
+const [SLOW_FPS, LEAST_RATIO] = [32, 0.45]; // frame rate below which fewer pixels are drawn, and the fewest
 const SURE_M = [0.03, 0.16]; // deviations of a joint (m) that are drawn in full colour, and palest
 
 export class Scene {
   constructor(canvas) {
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
+    const weak = isWeak();
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !weak, powerPreference: "high-performance" });
+    this.ratio = Math.min(window.devicePixelRatio, weak ? 0.7 : 1.5);
     this.renderer.shadowMap.enabled = true;
+    this.renderer.shadowMap.type = weak ? THREE.BasicShadowMap : THREE.PCFShadowMap;
     this.renderer.toneMapping = THREE.ACESFilmicToneMapping;
     this.renderer.toneMappingExposure = 1.15;
     this.scene = new THREE.Scene();
@@ -24,12 +28,12 @@ export class Scene {
     this.scene.add(new THREE.HemisphereLight(0xf4f8ff, 0xa89f92, 1.5));
     this.sun = new THREE.DirectionalLight(0xfff1de, 2.2);
     this.sun.castShadow = true;
-    this.sun.shadow.mapSize.set(1024, 1024);
+    this.sun.shadow.mapSize.setScalar(weak ? 512 : 1024);
     Object.assign(this.sun.shadow.camera, { left: -2.6, right: 2.6, top: 2.6, bottom: -2.6, near: 1, far: 14 });
     Object.assign(this.sun.shadow, { bias: -5e-4, normalBias: 0.02, radius: 4 });
     this.floor = new THREE.Mesh(
       new THREE.CircleGeometry(40, 48),
-      new THREE.MeshStandardMaterial({ map: tiles(), roughness: 0.95 }),
+      new THREE.MeshLambertMaterial({ map: tiles(weak ? 1 : 8) }),
     );
     this.floor.rotation.x = -Math.PI / 2;
     this.floor.receiveShadow = true;
@@ -41,17 +45,17 @@ export class Scene {
 
   resize() {
     const { clientWidth, clientHeight } = this.renderer.domElement;
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 1.5));
+    this.renderer.setPixelRatio(this.ratio);
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / Math.max(clientHeight, 1);
     this.camera.fov = this.camera.aspect < 1 ? 56 : 38;
     this.camera.updateProjectionMatrix();
   }
 
-  // Look at a place (three's axes) from where the camera stands now; `jump`: at once.
-  track(place, jump = false) {
+  // Move along with a place (three's axes) within some time (s).
+  track(place, elapsed) {
     const goal = place.clone().setY(Math.max(0.5, place.y * 0.9));
-    const share = jump ? 1 : this.follow ? 0.08 : 0;
+    const share = this.follow ? 1 - Math.exp(-5 * elapsed) : 0;
     const step = goal.sub(this.focus).multiplyScalar(share);
     this.focus.add(step);
     this.camera.position.add(step);
@@ -64,13 +68,20 @@ export class Scene {
     this.sun.position.set(place.x + 2.4, 6, place.z + 2.2);
   }
 
+  // Fewer pixels where the last second's frames were too few.
+  adapt(rate) {
+    if (rate >= SLOW_FPS || this.ratio <= LEAST_RATIO || this.renderer.xr.isPresenting) return;
+    this.ratio = Math.max(LEAST_RATIO, 0.85 * this.ratio);
+    this.resize();
+  }
+
   draw() {
     if (!this.renderer.xr.isPresenting) this.controls.update();
     this.renderer.render(this.scene, this.camera);
   }
 }
 
-function tiles() {
+function tiles(anisotropy) {
   const canvas = document.createElement("canvas");
   canvas.width = canvas.height = 256;
   const pen = canvas.getContext("2d");
@@ -83,8 +94,17 @@ function tiles() {
   texture.colorSpace = THREE.SRGBColorSpace;
   texture.wrapS = texture.wrapT = THREE.RepeatWrapping;
   texture.repeat.set(40, 40); // squares of one metre
-  texture.anisotropy = 4;
+  texture.anisotropy = anisotropy;
   return texture;
+}
+
+// Whether a processor draws in a graphics card's place; ?quality=fine or fast says otherwise.
+function isWeak() {
+  const stated = new URLSearchParams(location.search).get("quality");
+  if (stated) return stated === "fast";
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const about = gl?.getExtension("WEBGL_debug_renderer_info");
+  return /swiftshader|llvmpipe|software|basic render/i.test(about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "");
 }
 
 // A skinned body from a .glb that `wearcap export` wrote, with its name above it.
