@@ -236,10 +236,12 @@ const page = new Page();
 globalThis.wearcap = page; // for the console
 page.start().catch((error) => page.refuse(error.message));
 
-if ("serviceWorker" in navigator && isSecureContext) {
-  // Named after the folder's contents, so that another export is noticed.
+// Keep all files, named after the folder's contents, so that another export is noticed.
+async function keep() {
   const { version } = await (await fetch("files.json", { cache: "no-cache" })).json();
   await navigator.serviceWorker.register(`sw.js?${version}`);
   await navigator.serviceWorker.ready;
   get("offline").hidden = false;
 }
+
+if ("serviceWorker" in navigator && isSecureContext) keep().catch(console.warn);

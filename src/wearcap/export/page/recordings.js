@@ -38,8 +38,8 @@ export function readRecording(name, bytes, about, how = {}) {
   if (lines.length > MAX_ROWS) refuse("The file has more than a million rows: cut a few minutes out of it.");
   const header = lines[0].split(",").map((word) => word.trim());
   if (header.includes("tx_world_device")) return ofAria(header, lines, about);
-  const plain = lines.filter((line) => !line.startsWith("#") && !/[a-df-z]/i.test(line.replace(/nan/gi, "")));
-  if (plain.length >= lines.length - 2 && plain[0].trim().split(/[\s,]+/).length >= 8) return ofTrajectory(plain, about);
+  const plain = lines.filter((line) => !line.startsWith("#"));
+  if (plain.length > 2 && !/[a-df-z]/i.test(plain[0])) return ofTrajectory(plain, about);
   return ofHeadset(header, lines, about, how);
 }
 

@@ -6,7 +6,7 @@ self.addEventListener("install", (event) => {
   event.waitUntil((async () => {
     const { files } = await (await fetch("files.json", { cache: "no-cache" })).json();
     const cache = await caches.open(KEPT);
-    await cache.addAll(["./", ...files].map((name) => new Request(name, { cache: "no-cache" })));
+    await cache.addAll(["./", "files.json", ...files].map((name) => new Request(name, { cache: "no-cache" })));
     await self.skipWaiting();
   })());
 });

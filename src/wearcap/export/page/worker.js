@@ -28,6 +28,7 @@ async function open() {
   }));
   about = await json.json();
   body = new Skeleton(about.skeleton);
+  about.stature = body.stature;
   network = await ort.InferenceSession.create(new Uint8Array(await onnx.arrayBuffer()), { executionProviders: ["wasm"] });
   return { about };
 }
