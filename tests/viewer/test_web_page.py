@@ -52,12 +52,12 @@ def captured(
     browser: Chromium, skeleton: Skeleton, motion: str = "wearcap.motion"
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Times, and places of all joints, of the motion that the page captured."""
-    rows = torch.tensor(json.loads(browser.evaluate(f"JSON.stringify({motion}.rows.map((row) => Array.from(row)))")))
+    text = browser.evaluate(f"JSON.stringify({motion}.rows.map((row) => Array.from(row)))")
+    rows = torch.tensor(json.loads(text), dtype=torch.float64)
     joints = len(skeleton)
-    xyzw = rows[:, 4 : 4 + 4 * joints].unflatten(1, (joints, 4)).double()
-    T = forward_kinematics(skeleton, matrix_from_quat_wxyz(xyzw.roll(1, -1)), rows[:, 1:4].double())
-    times = json.loads(browser.evaluate(f"JSON.stringify({motion}.times)"))
-    return torch.tensor(times, dtype=torch.float64), T.t
+    xyzw = rows[:, 4 : 4 + 4 * joints].unflatten(1, (joints, 4))
+    T = forward_kinematics(skeleton, matrix_from_quat_wxyz(xyzw.roll(1, -1)), rows[:, 1:4])
+    return rows[:, 0], T.t
 
 
 def whole(browser: Chromium, frames: int) -> bool:
@@ -187,8 +187,8 @@ HEADSET = """(() => {
         device.position.set(0.1 * Math.sin(1.3 * t), 1.6 + 0.01 * Math.sin(5 * t), -0.1 * Math.cos(t));
         const turn = 0.2 * Math.sin(0.7 * t);
         device.quaternion.set(0, Math.sin(turn / 2), 0, Math.cos(turn / 2));
-        device.controllers.left.position.set(-0.3 + 0.05 * Math.sin(t), 1.1 + 0.15 * Math.sin(1.5 * t), -0.35);
-        device.controllers.right.position.set(0.28, 1.0 + 0.1 * Math.cos(t), -0.3);
+        device.controllers.left.position.set(-0.25 + 0.05 * Math.sin(t), 1.2 + 0.08 * Math.sin(1.5 * t), -0.25);
+        device.controllers.right.position.set(0.25, 1.15 + 0.08 * Math.cos(t), -0.22);
     };
     move();
     setInterval(move, 10);
@@ -219,7 +219,7 @@ def test_a_headset_drives_the_body_that_python_captures(system, page, tmp_path):
         pose = json.loads(
             browser.evaluate("""(() => {
             const {head, wrists, time} = wearcap.kept[wearcap.kept.length - 1];
-            const {skeleton, page} = wearcap.headset;
+            const {skeleton} = wearcap.headset;
             const {local, root} = wearcap.headset.posed(head, wrists);
             const {R, t} = skeleton.forward(local, root);
             return JSON.stringify({head: t[skeleton.head], device: head, wrists: wrists.map((wrist) => wrist.t),

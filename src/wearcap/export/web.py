@@ -32,6 +32,7 @@ from wearcap.io.devices.axes import DEVICES, OPENXR, UNITY, WORLDS
 from wearcap.io.devices.axes import UPRIGHT as UPRIGHT_AXIS
 from wearcap.io.devices.hand_seats import SEATS, palm_of, wrist_of_hand
 from wearcap.io.devices.headset_axes import FLOOR_M
+from wearcap.io.devices.headset_poses import FROZEN_S
 from wearcap.io.formats.gltf import write_glb
 from wearcap.recording import Motion, Recording
 from wearcap.runtime.graphs import Exports, SkeletonEntry
@@ -136,6 +137,7 @@ def constants() -> dict[str, Any]:
         "max_speed_m_s": MAX_SPEED_M_S,
         "max_turn_rad_s": MAX_TURN_RAD_S,
         "unseen_s": UNSEEN_S,
+        "frozen_s": FROZEN_S,
     }
 
 

@@ -35,7 +35,7 @@ export class Headset {
     page.scene.stage.add(this.body.group);
     page.scene.stage.visible = false; // until the wearer's height is known
     await renderer.xr.setSession(session);
-    Object.assign(this, { motion: null, skeleton: null, mirrored: false, samples: 0, session });
+    Object.assign(this, { motion: null, skeleton: null, mirrored: false, last: [null, null], session });
     session.addEventListener("end", () => this.#left());
     page.ask("live").catch((error) => page.refuse(error.message));
     this.job = page.jobs;
@@ -71,8 +71,7 @@ export class Headset {
     const viewer = frame.getViewerPose(space);
     if (!viewer) return;
     const head = this.#pose(viewer.transform);
-    const wrists = SIDES.map((side) => this.#wrist(frame, space, side));
-    this.samples++;
+    const wrists = SIDES.map((side, hand) => this.#moving(this.#wrist(frame, space, side), hand, now / 1000));
     this.page.worker.postMessage({ kind: "sample", id: this.job, sample: { time: now / 1000, head, wrists } });
     if (!this.motion?.times.length) return;
     if (!this.mirrored) this.#mirror(head);
@@ -111,8 +110,15 @@ export class Headset {
     const source = [...this.session.inputSources].find((each) => each.handedness === side);
     const joint = source?.hand?.get("wrist");
     const found = joint ? frame.getJointPose(joint, space) : source?.gripSpace && frame.getPose(source.gripSpace, space);
-    if (!found || found.emulatedPosition) return null;
+    if (!found) return null;
     return wristOf(this.#pose(found.transform), this.page.about.seats[joint ? "wrist" : "grip"][`${side}_wrist`]);
+  }
+
+  // The wrist, null where it stands still to the last digit: it is lost, and its last place is reported.
+  #moving(wrist, hand, time) {
+    const last = this.last[hand];
+    if (!wrist || !last || wrist.t.some((value, k) => value !== last.t[k])) this.last[hand] = wrist && { t: wrist.t, time };
+    return wrist && time - this.last[hand].time < this.page.about.frozen_s ? wrist : null;
   }
 
   // A pose of WebXR in the body's axes.
