@@ -64,8 +64,8 @@ class PiecesSource(Source):
         """The packets of a piece's tracked hands."""
         packets = []
         for hand, side in HANDS.items():
-            stream = piece.fingers.get(side)
-            for k, sent_s in enumerate([] if stream is None else stream.timestamps.tolist()):
-                sample = HandSample(side, sent_s, stream.frame(k))
-                packets.append(Packet(self.wearer, hand, self.name, sent_s, time.monotonic(), sample))
+            if (stream := piece.fingers.get(side)) is not None:
+                for k, sent_s in enumerate(stream.timestamps.tolist()):
+                    sample = HandSample(side, sent_s, stream.frame(k))
+                    packets.append(Packet(self.wearer, hand, self.name, sent_s, time.monotonic(), sample))
         return packets
