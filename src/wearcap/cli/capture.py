@@ -208,7 +208,9 @@ class _Shown(Sink):
 def _live(system: System, config: DictConfig, folder: Path) -> None:
     """Follow a growing recording: the motion's files grow with it."""
     if config.to_rig is not None:
-        fix = f"Afterwards: wearcap capture recording={folder}/wearer/motion.npz pipeline=recorded to_rig={config.to_rig}"
+        fix = (
+            f"Afterwards: wearcap capture recording={folder}/wearer/motion.npz pipeline=recorded to_rig={config.to_rig}"
+        )
         raise WearcapError("to_rig=… while a recording grows", expected="a whole recording", fix=fix)
     growing = Path(config.recording)
     if not growing.is_dir():
