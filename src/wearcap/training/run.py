@@ -351,7 +351,7 @@ def record_run(folder: Path, config_yaml: str) -> None:
         commit = subprocess.run(command, cwd=here, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         commit = "not a git checkout"
-    names = ("wearcap", "torch", "lightning", "numpy", "hydra-core", "numba", "anny")
+    names = ("wearcap", "torch", "lightning", "numpy", "hydra-core", "numba")
     record = {
         "commit": commit,
         "python": platform.python_version(),
