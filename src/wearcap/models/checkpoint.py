@@ -86,7 +86,7 @@ def checkpoint_file(path: str | Path) -> Path:
     path = Path(path)
     if os.path.exists(path) or not _NAME.fullmatch(str(path)):
         return path
-    if (here := _folder() / f"{path.name}{_SUFFIX}").is_file():
+    if os.path.isfile(here := _folder() / f"{path.name}{_SUFFIX}"):
         return here
     shared = shared_checkpoints()
     if path.name not in shared:
