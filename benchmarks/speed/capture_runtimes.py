@@ -1,8 +1,8 @@
-"""Whole recordings captured in ONNX Runtime against PyTorch, on this machine's CPU: ECHO and HMD² by a headset's walk, MocapEvery by
-two watches.
+"""Whole recordings captured in ONNX Runtime against PyTorch, on this machine's CPU.
 
-value: frames per second of a capture with `runtime=onnx`, everything but the start included; baseline: with `runtime=eager`, in turns.
-`…_start`: seconds that the first capture takes longer, in which the graphs are exported. No goals: they decide the default runtime.
+ECHO and HMD² by a headset's walk, MocapEvery by two watches. value: frames per second of a capture with `runtime=onnx`, everything
+but the start included; baseline: with `runtime=eager`, in turns. `capture_onnx_start_…`: seconds that the first capture takes longer,
+in which the graphs are exported; baseline: seconds of a capture with eager. No goals: they decide the default runtime.
 """
 
 import time
@@ -30,6 +30,6 @@ def measure(
         frames = len(onnx(recording))
         start = time.perf_counter() - began
         slow, fast = in_turns([partial(eager, recording), partial(onnx, recording)], rounds)
-        rows.append(figure(f"{name}_capture_onnx_fps", frames / fast, "frames/s", frames / slow, slow / fast, None))
-        rows.append(figure(f"{name}_onnx_start", start - fast, "s", slow, (start - fast) / slow, None))
+        rows.append(figure(f"capture_onnx_fps_{name}", frames / fast, "frames/s", frames / slow, slow / fast, None))
+        rows.append(figure(f"capture_onnx_start_{name}", start - fast, "s", slow, (start - fast) / slow, None))
     return rows
