@@ -3,9 +3,11 @@ they say to files of strangers."""
 
 import base64
 import hashlib
+import io
 import json
 import re
 import shutil
+import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,8 +20,9 @@ import wearcap
 from wearcap.cli.conf import compose
 from wearcap.cli.export import with_page_pipeline
 from wearcap.errors import WearcapError
+from wearcap.export import web
 from wearcap.export.files import open_exported
-from wearcap.export.web import PAGE, page_exports, require_libraries, write_page
+from wearcap.export.web import LIBRARIES, PAGE, fetched_libraries, page_exports, require_libraries, write_page
 from wearcap.io.devices.aria_mps import read_mps
 from wearcap.reading import read
 from wearcap.runtime.system import CaptureInput
@@ -221,6 +224,37 @@ def test_libraries_of_another_version_are_refused(tmp_path):
     (tmp_path / "three/package.json").write_text(json.dumps(about | {"version": "0.1.0"}))
     with pytest.raises(WearcapError, match=r"three 0\.1\.0"):
         require_libraries(tmp_path)
+
+
+def test_libraries_are_unpacked_from_verified_packages(tmp_path, monkeypatch):
+    """From a folder of a machine without a network; nothing but the named files is taken."""
+    entries, weights = {}, tmp_path / "weights"
+    weights.mkdir()
+    for package, names in LIBRARIES.items():
+        archive = weights / f"{package}-1.2.3.tgz"
+        with tarfile.open(archive, "w:gz") as tar:
+            for name in ("package.json", *names, "../outside.js", "unneeded.js"):
+                content = json.dumps({"version": "1.2.3", "of": name}).encode()
+                about = tarfile.TarInfo(f"package/{name}")
+                about.size = len(content)
+                tar.addfile(about, io.BytesIO(content))
+        digest = base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode()
+        entries[package] = {
+            "version": "1.2.3",
+            "integrity": f"sha512-{digest}",
+            "resolved": f"https://none.invalid/{package}",
+        }
+    monkeypatch.setattr(web, "locked", lambda: entries)
+    monkeypatch.setenv("WEARCAP_WEIGHTS", str(weights))
+    monkeypatch.setenv("WEARCAP_CACHE", str(tmp_path / "cache"))
+    folder = fetched_libraries()
+    require_libraries(folder)
+    assert not list(tmp_path.rglob("outside.js"))
+    assert not list(tmp_path.rglob("unneeded.js"))
+    shutil.rmtree(folder)
+    (weights / "three-1.2.3.tgz").write_bytes(b"another")
+    with pytest.raises(WearcapError, match="another file"):
+        fetched_libraries()
 
 
 def test_the_command_takes_the_streaming_pipeline():

@@ -9,6 +9,7 @@ import importlib
 import importlib.util
 import json
 import shutil
+import tarfile
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +22,12 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import WRISTS, Skeleton
+from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import read_json_object
 from wearcap.errors import WearcapError
 from wearcap.export.files import ExportReport, export_network
-from wearcap.files import explaining_writes, resource, sha256_of
+from wearcap.fetch import Remote, fetch
+from wearcap.files import atomic_path, cache_folder, content_hash, explaining_writes, resource, sha256_of
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.io.devices.aria_mps import R_CPF_DEVICE, T_HEAD_DEVICE, nominal_T_aria_cpf
@@ -43,8 +46,6 @@ from wearcap.tracking.wrists import UNSEEN_S
 
 VERSION = 1
 """Version of the folder's `network.json`."""
-VERTICES = 2500
-"""Size of the bodies' surfaces."""
 PAGE = Path(__file__).with_name("page")
 MAX_SAMPLE_S = 60.0
 """Longest part (s) of a recording that becomes the folder's sample."""
@@ -61,7 +62,8 @@ LIBRARIES = {
     "onnxruntime-web": ("README.md", "dist/ort.wasm.bundle.min.mjs", "dist/ort-wasm-simd-threaded.wasm"),
 }
 """Files of npm's packages that the page loads, by the packages that `integrations/web/package-lock.json` locks."""
-_NPM = "Run `npm ci` in integrations/web and give libraries=integrations/web/node_modules."
+MAX_TARBALL = 256 << 20
+"""Most bytes of a package that is downloaded."""
 
 
 def page_exports(system: Any) -> Exports:
@@ -99,7 +101,7 @@ def write_page(exports: Exports, folder: str | Path, recording: Recording, libra
         about |= {"sha256": sha256_of(out / "network.onnx"), "outputs": list(graph.inputs)}
         _write_json(out / "network.json", about)
         skeleton = convert(exports.about["skeleton"], SkeletonEntry).skeleton()
-        write_glb(_resting(skeleton), out / "body.glb", anny_body(skeleton, vertices=VERTICES))
+        write_glb(_resting(skeleton), out / "body.glb", anny_body(skeleton))
         _write_sample(recording, skeleton, out)
         _write_json(out / "files.json", _contents(out))
         with explaining_writes(folder):
@@ -141,24 +143,43 @@ def constants() -> dict[str, Any]:
     }
 
 
+def locked() -> dict[str, dict[str, Any]]:
+    """Entries of `LIBRARIES` in the lock of npm's packages: version, address and digest of each."""
+    lock = read_json_object(resource("integrations/web", "web") / "package-lock.json")["packages"]
+    return {package: lock[f"node_modules/{package}"] for package in LIBRARIES}
+
+
 def require_libraries(folder: Path) -> None:
     """Raise WearcapError unless a folder of npm's packages holds those of the lock with all files that a page loads."""
-    lock = read_json_object(resource("integrations/web", "web") / "package-lock.json")["packages"]
-    for package, names in LIBRARIES.items():
-        for name in ("package.json", *names):
+    fix = "Run `npm ci` in integrations/web and give libraries=integrations/web/node_modules."
+    for package, entry in locked().items():
+        for name in ("package.json", *LIBRARIES[package]):
             if not (folder / package / name).is_file():
-                raise WearcapError(f"no {package}/{name}", where=folder, expected="a node_modules folder", fix=_NPM)
-        version, wanted = (
-            read_json_object(folder / package / "package.json")["version"],
-            lock[f"node_modules/{package}"]["version"],
-        )
+                raise WearcapError(f"no {package}/{name}", where=folder, expected="a node_modules folder", fix=fix)
+        version, wanted = read_json_object(folder / package / "package.json")["version"], entry["version"]
         if version != wanted:
-            raise WearcapError(f"{package} {version}", where=folder, expected=f"version {wanted}", fix=_NPM)
+            raise WearcapError(f"{package} {version}", where=folder, expected=f"version {wanted}", fix=fix)
 
 
 def fetched_libraries() -> Path:
-    """A folder of npm's packages as `require_libraries` wants it. Raises WearcapError without one."""
-    raise WearcapError("no libraries=FOLDER", expected="npm's packages of integrations/web", fix=_NPM)
+    """A folder of the lock's packages, downloaded into the user's cache and verified. Raises WearcapError as `fetch` does."""
+    entries = locked()
+    folder = cache_folder() / "web" / content_hash(entries)
+    for package, entry in entries.items():
+        name = f"{package}-{entry['version']}.tgz"
+        remote = Remote(name, (entry["resolved"],), entry["integrity"], MAX_TARBALL)
+        names = ("package.json", *LIBRARIES[package])
+        if all((folder / package / name).is_file() for name in names):
+            continue
+        archive = fetch(remote)
+        damage = tarfile.TarError, LookupError
+        with understood("not a package of npm", archive, "its files", errors=damage), tarfile.open(archive) as tar:
+            for name in names:  # nothing else is read, and these are written under our own names
+                content = tar.extractfile(f"package/{name}")
+                assert content is not None
+                with atomic_path(folder / package / name) as temporary:
+                    temporary.write_bytes(content.read())
+    return folder
 
 
 def _write_sample(recording: Recording, fallback: Skeleton, out: Path) -> None:
@@ -197,7 +218,7 @@ def _write_sample(recording: Recording, fallback: Skeleton, out: Path) -> None:
         "skeleton": _offsets(skeleton),
     }
     _write_json(out / "sample.json", sample)
-    body: BodyModel = anny_body(skeleton, recording.shape or None, VERTICES)
+    body: BodyModel = anny_body(skeleton, recording.shape or None)
     write_glb(motion if known and motion is not None else _resting(skeleton), out / "sample.glb", body)
 
 
