@@ -10,7 +10,9 @@ const SURE_M = [0.03, 0.16]; // deviations of a joint (m) that are drawn in full
 
 export class Scene {
   constructor(canvas) {
-    const weak = isWeak();
+    const stated = new URLSearchParams(location.search).get("quality"); // fine or fast; otherwise found out
+    const weak = stated ? stated === "fast" : isWeak();
+    this.adapts = stated !== "fine";
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !weak, powerPreference: "high-performance" });
     this.ratio = Math.min(window.devicePixelRatio, weak ? 0.7 : 1.5);
     this.renderer.shadowMap.enabled = true;
@@ -70,7 +72,7 @@ export class Scene {
 
   // Fewer pixels where the last second's frames were too few.
   adapt(rate) {
-    if (rate >= SLOW_FPS || this.ratio <= LEAST_RATIO || this.renderer.xr.isPresenting) return;
+    if (!this.adapts || rate >= SLOW_FPS || this.ratio <= LEAST_RATIO || this.renderer.xr.isPresenting) return;
     this.ratio = Math.max(LEAST_RATIO, 0.85 * this.ratio);
     this.resize();
   }
@@ -98,10 +100,8 @@ function tiles(anisotropy) {
   return texture;
 }
 
-// Whether a processor draws in a graphics card's place; ?quality=fine or fast says otherwise.
+// Whether a processor draws in a graphics card's place.
 function isWeak() {
-  const stated = new URLSearchParams(location.search).get("quality");
-  if (stated) return stated === "fast";
   const gl = document.createElement("canvas").getContext("webgl2");
   const about = gl?.getExtension("WEBGL_debug_renderer_info");
   return /swiftshader|llvmpipe|software|basic render/i.test(about ? gl.getParameter(about.UNMASKED_RENDERER_WEBGL) : "");
