@@ -255,3 +255,9 @@ def test_a_headset_drives_the_body_that_python_captures(system, page, tmp_path):
     count = min(len(times), len(motion))
     assert count > 120
     assert (joints[:count] - motion.T_world_joint.t[:count]).norm(dim=-1).max() < 1e-3
+
+
+def test_the_benchmark_counts_frames(page):
+    found = measured(page, 1.0, (320, 200))
+    assert found["value"] > 0
+    assert 0 < found["window_ms"] < 60_000

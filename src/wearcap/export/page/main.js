@@ -128,7 +128,7 @@ class Page {
       this.motion.add(data.rows);
       this.spent = data.spent;
       this.#report();
-    } else if (kind === "done") this.#report(data.took);
+    } else if (kind === "done") this.#report((this.took = data.took));
   }
 
   #report(took) {

@@ -70,9 +70,10 @@ export class Scene {
     this.sun.position.set(place.x + 2.4, 6, place.z + 2.2);
   }
 
-  // Fewer pixels where the last second's frames were too few.
+  // Fewer pixels where the last second's frames were too few, and at last no shadows.
   adapt(rate) {
-    if (!this.adapts || rate >= SLOW_FPS || this.ratio <= LEAST_RATIO || this.renderer.xr.isPresenting) return;
+    if (!this.adapts || rate >= SLOW_FPS || this.renderer.xr.isPresenting) return;
+    if (this.ratio <= LEAST_RATIO) this.sun.castShadow = false;
     this.ratio = Math.max(LEAST_RATIO, 0.85 * this.ratio);
     this.resize();
   }
