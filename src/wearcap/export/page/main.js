@@ -202,6 +202,7 @@ class Page {
     get("seat").onchange = () => this.read().catch((error) => this.refuse(error.message));
     get("file").onchange = ({ target }) => this.open(target.files[0]).finally(() => (target.value = ""));
     get("open").onclick = () => get("file").click();
+    get("error").onclick = ({ target }) => (target.hidden = true);
     get("sample").onclick = () => this.show(this.sample);
     get("enter").onclick = () => this.headset.enter().catch((error) => this.refuse(error.message));
     const keys = {
