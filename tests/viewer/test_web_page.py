@@ -12,6 +12,7 @@ import pytest
 import torch
 
 import wearcap
+from benchmarks.speed.browser_page import measured
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton, skeleton_of_height
 from wearcap.geometry.rigid import Rigid
@@ -135,7 +136,7 @@ def test_a_dropped_file_is_captured_as_python_captures_it(system, page, tmp_path
         drop(browser, "<i>walk</i>.csv", file.read_bytes())
         browser.poll(lambda: browser.evaluate("wearcap.recording.name") == "<i>walk</i>.csv", LONG_S)
         assert browser.evaluate("document.getElementById('title').textContent") == "<i>walk</i>.csv"
-        browser.poll(lambda: browser.evaluate("wearcap.height?.height > 0 && wearcap.motion.times.length > 0"), LONG_S)
+        browser.poll(lambda: browser.evaluate("wearcap.height?.height > 0 && wearcap.motion?.times.length > 0"), LONG_S)
         height = browser.evaluate("wearcap.height.height")
         walk = read(file)
         found = estimate_stature(walk, system.model.skeleton)

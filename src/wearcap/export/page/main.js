@@ -46,7 +46,7 @@ class Page {
 
   // Show a recording: the sample with its truth, or a file's.
   async show(recording) {
-    this.recording = recording;
+    Object.assign(this, { recording, motion: null, job: null, height: null });
     this.clear();
     const own = recording === this.recording && recording.skeleton;
     const made = [Body.load(own ? "sample.glb" : "body.glb", "captured", COLORS.capture)];

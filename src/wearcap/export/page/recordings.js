@@ -1,7 +1,7 @@
 // Files that people drag into the page, as recordings {head, wrists, mount, floor}: a headset's log, Aria's closed loop, TUM's
 // or EuRoC's trajectories, a page's own sample. They may hold anything: what is wrong is said in one line.
 
-import { add, column, dot, mul, norm, ofQuat, sub, toQuat, transpose, turned, unit } from "./rotation.js";
+import { aboutZ, add, column, dot, mul, norm, ofQuat, sub, toQuat, transpose, turned, yaw } from "./rotation.js";
 import { quantile } from "./session.js";
 
 const MAX_BYTES = 256 * 2 ** 20;
@@ -225,26 +225,37 @@ export function wristOf(device, seat) {
   return { R, t: sub(device.t, turned(R, seat.t)) };
 }
 
-// Unity's z points ahead, OpenXR's back: heads walk ahead and see their hands.
+// Unity's z points ahead, OpenXR's back: heads walk ahead and look down, hands are held ahead. In nats, as in
+// wearcap.io.devices.headset_axes.
 function likelyAxes(raw, about) {
+  const limit = (value, most) => Math.min(Math.max(value, -most), most);
   const scores = Object.entries(about.axes).map(([name, axes]) => {
-    const head = inAxes(raw.head, axes);
-    const every = Math.max(1, Math.floor(head.poses.length / 500));
-    const some = head.poses.filter((_, k) => k % every === 0);
-    const R = some.map((pose) => ofQuat(pose.slice(3)));
-    let score = 0.3 * ahead(R, some.map((pose) => pose.slice(0, 3)));
+    const { times, poses } = inAxes(raw.head, axes);
+    const R = poses.map((pose) => ofQuat(pose.slice(3)));
+    const heading = R.map((turn) => aboutZ(yaw(turn)));
+    const down = R.reduce((sum, turn) => sum + Math.asin(-limit(turn[6], 1)), 0) * (180 / Math.PI / R.length);
+    let score = limit((10 * down) / 144, 3);
+    const step = (times[times.length - 1] - times[0]) / (times.length - 1);
+    const base = Math.max(1, Math.round(1 / 6 / step));
+    let [along, walking] = [0, 0];
+    for (let k = base; k + base < poses.length; k++) {
+      const [x, y] = sub(poses[k + base], poses[k - base]);
+      const length = Math.hypot(x, y);
+      if (length < 0.4 * 2 * base * step) continue;
+      along += (x * heading[k][0] + y * heading[k][3]) / length;
+      walking++;
+    }
+    if (walking) score += (1.5 * Math.min(1, (walking * step) / 6) * along) / walking;
     for (const side of ["left", "right"]) {
       if (!raw[side]) continue;
-      const hand = inAxes(raw[side], axes);
       let at = 0;
-      const before = some.map((pose, k) => {
-        while (at + 1 < hand.times.length && hand.times[at + 1] <= head.times[k * every]) at++;
-        const [x, y] = sub(hand.poses[at], pose);
-        const sideways = column(R[k], 1);
-        const [forward, aside] = [unit([x, y, 0]), side === "left" ? 1 : -1];
-        return dot(forward, column(R[k], 0)) + aside * dot(forward, sideways);
+      const hand = inAxes(raw[side], axes);
+      const before = hand.poses.map((pose, k) => {
+        while (at + 1 < times.length && times[at + 1] <= hand.times[k]) at++;
+        const neck = add(poses[at].slice(0, 3), turned(R[at], [-0.1, 0, -0.1]));
+        return dot(sub(pose, neck), column(heading[at], 0));
       });
-      score += before.reduce((sum, value) => sum + value, 0) / before.length;
+      score += (0.15 * limit(quantile(before, 0.5), 0.4)) / 0.0484;
     }
     return { name, score };
   });
