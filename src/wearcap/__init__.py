@@ -22,7 +22,7 @@ def read(path, height: float | None = None, **stated):
     """The `recording.Recording` in any file or folder that holds one: a prepared recording, MVNX, BVH, AMASS, MPS, logs …
 
     `height` (m) is the wearer's; without it, and without a skeleton in the file, it follows from how high the head is
-    carried. `stated` is what the file's content need not decide: unit="cm", up="y", axes="unity" … (`io.conventions`).
+    carried. `stated` is what the file's content need not decide: unit="cm", up="y", axes="unity" … (`io.conventions.Conventions`).
     Raises WearcapError for what cannot be read.
     """
     return source(path, height, **stated).recording
@@ -58,3 +58,14 @@ def save(motion, path, rig=None, keep_hands: bool = False) -> None:
         save_motion(motion, path)
     else:
         write_on_rig(motion, read_rig(rig), path, keep_hands)
+
+
+def show(motion, seconds: float = 10.0, fps: float = 15.0, size: tuple[int, int] = (360, 320), **beside):
+    """A video of a `recording.Motion` for a notebook, which shows it where it is the value of a cell (`apps.viewer.inline.Video`).
+
+    `beside` are further motions of the same moments, by their labels (truth=recording.motion), in panels of their own of `size`
+    (width, height, in pixels). It lasts `seconds` at most. Raises WearcapError for motions that share no time, and for odd sizes.
+    """
+    from wearcap.apps.viewer.inline import Video
+
+    return Video.of({"motion": motion, **beside}, fps, size, seconds)
