@@ -61,10 +61,10 @@ addon:
 	$(PYTHON) -m zipfile -c dist/wearcap_blender.zip integrations/blender/wearcap_blender/*.*
 
 site: $(VENV)/.site-installed $(patsubst examples/%,build/%,$(wildcard examples/notebooks/*.ipynb))
-	$(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 site-serve: $(VENV)/.site-installed
-	$(BIN)/mkdocs serve
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
 
 build/notebooks/%.ipynb: examples/notebooks/%.ipynb | $(VENV)/.site-installed
 	$(BIN)/python -m nbconvert --to notebook --execute --output-dir $(@D) $<

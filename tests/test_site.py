@@ -5,15 +5,27 @@ import inspect
 import re
 import subprocess
 import sys
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from types import ModuleType
+from urllib.parse import urlsplit
 
 import pytest
 
 import wearcap
+from wearcap_browser import chromium
 
 ROOT = Path(__file__).parents[1]
 REPOSITORY = "https://github.com/wearcap/wearcap"
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """Serves a folder, and says nothing."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +41,20 @@ def hooks() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def site(hooks, tmp_path_factory) -> dict[str, str]:
-    """The site's files of text, by path."""
+def built(hooks, tmp_path_factory) -> Path:
+    """Folder of the site, built without a warning."""
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
-    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert built.returncode == 0, built.stderr[-4000:]
-    texts = (path for path in folder.rglob("*") if path.suffix in (".html", ".css"))
-    return {path.relative_to(folder).as_posix(): path.read_text(encoding="utf-8") for path in texts}
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr[-4000:]
+    return folder
+
+
+@pytest.fixture(scope="module")
+def site(built) -> dict[str, str]:
+    """The site's files of text, by path."""
+    texts = (path for path in built.rglob("*") if path.suffix in (".html", ".css"))
+    return {path.relative_to(built).as_posix(): path.read_text(encoding="utf-8") for path in texts}
 
 
 def test_every_page_is_there(site):
@@ -98,6 +116,7 @@ def test_the_api_shows_what_the_package_offers(site):
     assert 'id="wearcap.recording.Motion.t_world_root"' in motion
     assert re.search(r'href="\.\./body/#wearcap\.body\.skeleton\.Skeleton"', motion)
     assert '<span class="s2">"time"</span>' in motion, "a shape of one word is text"
+    assert 'id="wearcap.runtime.system.System.__call__"' in site["api/system/index.html"]
     assert re.search(r'<a [^>]*href="\.\./system/#wearcap\.runtime\.system\.System"[^>]*><code>', page)
 
 
@@ -107,3 +126,22 @@ def test_the_gallery_shows_every_picture(site):
         assert f'src="../{path.name}"' in gallery or f'src="{path.name}"' in site["index.html"], path.name
         assert path.stat().st_size <= 500_000
     assert gallery.count("<video ") == 2
+
+
+@pytest.mark.browser
+def test_a_browser_finds_words_and_plays_videos_from_the_site_alone(built, tmp_path):
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(built)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}"
+    try:
+        with chromium(tmp_path / "profile", f"{address}/?q=static-object", webgl=False) as browser:
+            found = "[...document.querySelectorAll('.md-search-result__item a')].map(a => a.pathname).join(' ')"
+            browser.poll(lambda: "/ireplica/" in browser.evaluate(found))
+            browser.go(f"{address}/gallery/")
+            playing = "(v => v && (v.play(), v.readyState > 2 && v.videoWidth))(document.querySelector('video'))"
+            assert browser.poll(lambda: browser.evaluate(playing)) == 400
+            loaded = browser.evaluate("performance.getEntriesByType('resource').map(entry => entry.name).join(' ')")
+            assert {urlsplit(name).netloc for name in loaded.split()} == {urlsplit(address).netloc}
+    finally:
+        server.shutdown()
+        server.server_close()

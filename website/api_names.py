@@ -33,11 +33,12 @@ def _linked(obj: griffe.Object, name: str) -> str:
 
 
 def _quote_shapes(annotation: griffe.Expr) -> None:
-    """Shapes of one word, such as "time", which are read as names, as the text that they are."""
+    """Shapes as the text that they are; those of one word, such as "time", are read as names."""
     for part in annotation.iterate(flat=False):
         if isinstance(part, griffe.Expr) and part is not annotation:
             _quote_shapes(part)
     if isinstance(annotation, griffe.ExprSubscript) and str(annotation.left) in ARRAYS:
         array = annotation.slice
-        if isinstance(array, griffe.ExprTuple) and isinstance(array.elements[1], griffe.ExprName):
-            array.elements[1] = f'"{array.elements[1].name}"'
+        if isinstance(array, griffe.ExprTuple):
+            shape = str(array.elements[1]).strip("'\"")
+            array.elements[1] = f'"{shape}"'

@@ -56,6 +56,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         page.meta["hide"] = ["navigation"]
     elif page.file.src_uri.startswith("notebooks/"):
         page.meta["hide"] = ["toc"]
+    elif page.file.src_uri.startswith("api/"):
+        page.meta["search"] = {"boost": 0.5}  # behind the guides
     parts = FENCED.split(markdown)
     parts[::2] = [LINK.sub(lambda link: mended(link, page.file.src_uri, config, files), part) for part in parts[::2]]
     return "".join(parts)
