@@ -14,6 +14,8 @@ USD = ["usda"] if importlib.util.find_spec("pxr") else []
 
 
 def test_a_capture_writes_the_formats_of_the_list(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "gait.json").write_text("{}")  # of somebody who walked
     write_motion(walk(1.0), tmp_path / "walk.npz")
     given = [
         "pipeline=recorded",
@@ -24,6 +26,12 @@ def test_a_capture_writes_the_formats_of_the_list(tmp_path):
     formats = ["vrma", "bvh", *USD]
     capture.main([*given, "video=false", "body=false", "smpl=false", f"formats=[{','.join(formats)}]"])
     assert {path.name for path in (tmp_path / "out").iterdir()} == {f"motion.{ending}" for ending in ("npz", *formats)}
+
+
+def test_a_character_cannot_move_while_a_recording_grows(tmp_path):
+    given = ["pipeline=hps", "live=true", f"recording={tmp_path}", f"to_rig={tmp_path}/hero.glb"]
+    with pytest.raises(WearcapError, match="to_rig.*pipeline=recorded to_rig="):
+        capture.main([*given, f"hydra.run.dir={tmp_path}/run"])
 
 
 @pytest.mark.parametrize("formats", ["usd", ["glb", "fbx"], [""]])

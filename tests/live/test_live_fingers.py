@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 
 import mvn_datagrams as mvn
 import numpy as np
@@ -20,9 +21,10 @@ from wearcap.apps.live.sources import source_of
 from wearcap.apps.live.sources.mvn import FINGER_SEGMENTS
 from wearcap.apps.live.sources.replay import ReplaySource
 from wearcap.body.hands import FINGER_NAMES, HAND_JOINTS, MEDIAPIPE, OPENXR
+from wearcap.geometry.rotation import geodesic
 from wearcap.io.devices.headset_axes import CONVENTIONS
 from wearcap.recording import FingerStream
-from wearcap.tracking.fingers import fit_hand
+from wearcap.tracking.fingers import fit_hand, with_fingers
 
 
 def message(places: np.ndarray, names, side="left", **more) -> bytes:
@@ -107,6 +109,23 @@ def test_a_live_capture_has_the_hands_fingers_at_its_own_rate():
     assert bones_of(motion)[0].shape[1] == len(BONES) + len(FINGER_BONES)
     assert json.loads(_frame("", motion, 20, {}))["fingers_measured"] == [True, False]
     assert HEAD == "head"
+
+
+def test_a_replay_has_the_recordings_fingers():
+    system, angles = small_hmd2(), planted.moving(150)
+    recording = swaying()
+    stream = planted.stream(planted.carried(planted.joints(angles, "right")))
+    recording = replace(recording, fingers={"right": stream})
+    kept, source = Kept(), ReplaySource(recording, system.session_class(), float("inf"))
+    LiveCapture(system, [source], [kept], known=Known(setup=source.setup)).run(60.0)
+    motion, expected = kept.motion(), with_fingers(system(recording, 0), recording.fingers)
+    torch.testing.assert_close(motion.timestamps, expected.timestamps)
+    assert motion.fingers_measured is not None and expected.fingers_measured is not None  # noqa: PT018
+    rows = slice(5, None)  # samples before the head's first have no clock yet
+    torch.testing.assert_close(motion.fingers_measured[rows], expected.fingers_measured[rows])
+    assert expected.fingers_measured[rows, 1].sum() > 100
+    off = geodesic(motion.R_parent_joint[rows, -30:].double(), expected.R_parent_joint[rows, -30:].double())
+    assert torch.rad2deg(off).max() < 0.5
 
 
 def test_mvn_gloves():

@@ -14,10 +14,12 @@ from hps_walk import floor_points, hps_recording
 from hydra.utils import instantiate
 from test_hps_stream import pieces
 
+import planted_hands as planted
 from wearcap.apps.live.capture import LiveCapture
 from wearcap.apps.live.setup import Known
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.sources.replay import ReplaySource
+from wearcap.body.hands import has_fingers
 from wearcap.cli.capture import main as capture
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
@@ -106,6 +108,29 @@ def test_a_growing_recording_becomes_the_motion_of_its_pieces(tmp_path):
     torch.testing.assert_close(found.timestamps, whole.timestamps, rtol=0, atol=0)
     torch.testing.assert_close(found.t_world_root, whole.t_world_root, rtol=0, atol=0)
     torch.testing.assert_close(found.R_parent_joint, whole.R_parent_joint, rtol=0, atol=1e-6)
+
+
+def test_a_growing_recording_has_its_hands_fingers(tmp_path):
+    parts, growing = pieces(hps_recording(seconds=8.0)), tmp_path / "growing"
+    for number, part in enumerate(parts):
+        times = part.suit.timestamps
+        hand = planted.stream(planted.joints(planted.moving(len(times), number), "left"))
+        write_piece(replace(part, fingers={"left": replace(hand, timestamps=times)}), growing, number)
+    close_pieces(growing)
+    capture(
+        [
+            "pipeline=paper/hps_without_scene",
+            "live=true",
+            f"recording={growing}",
+            f"output={tmp_path}",
+            f"hydra.run.dir={tmp_path}",
+        ]
+    )
+    motion = read_motion(tmp_path / "wearer" / "motion.npz")
+    assert has_fingers(motion.skeleton)
+    assert motion.fingers_measured is not None
+    assert motion.fingers_measured[:, 0].mean() > 0.95
+    assert not motion.fingers_measured[:, 1].any()
 
 
 def test_a_system_that_follows_no_growing_recording_says_so():

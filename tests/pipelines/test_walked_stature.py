@@ -8,7 +8,7 @@ import torch
 from wearcap.body.skeleton import skeleton_of_height, xsens23
 from wearcap.geometry import rotation
 from wearcap.metrics.gait import crouches, normal_knee_deg
-from wearcap.recording import Motion, PointCloud, Recording
+from wearcap.recording import FloorTrack, Motion, PointCloud, Recording
 from wearcap.runtime.system import Captured, CaptureInput, System
 from wearcap.runtime.walked_stature import with_walked_stature
 from wearcap.tracking.stature import Stature
@@ -42,9 +42,10 @@ class Walker(System):
         return [Captured(walk(self.per_m * (s.recording.skeleton.stature - 1.68))) for s in sources]
 
 
-def source(points: bool = True) -> CaptureInput:
+def source(points: bool = True, floor: bool = False) -> CaptureInput:
     cloud = PointCloud(torch.zeros(10, 3)) if points else None
-    return CaptureInput(Recording("walk", points=cloud))
+    ground = FloorTrack(torch.zeros(1, dtype=torch.float64), torch.zeros(1)) if floor else None
+    return CaptureInput(Recording("walk", points=cloud, floor=ground))
 
 
 def test_the_height_is_between_what_the_head_and_the_knees_say():
@@ -54,6 +55,7 @@ def test_the_height_is_between_what_the_head_and_the_knees_say():
     assert 1.675 < walked.height_m < 1.695
     assert walked.deviation_m < FOUND.deviation_m
     assert "1.69 ± 0.02" in str(walked)
+    assert with_walked_stature(Walker(), source(False, floor=True), FOUND, xsens23())[1] == walked
     _, sure = with_walked_stature(Walker(), source(), replace(FOUND, deviation_m=0.005), xsens23())
     assert abs(sure.height_m - 1.70) < abs(walked.height_m - 1.70), "the head is believed as far as it is sure"
     _, blind = with_walked_stature(Walker(per_m=0.0), source(), FOUND, xsens23())

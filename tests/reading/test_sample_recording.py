@@ -11,7 +11,7 @@ SAMPLE = PROJECT / "examples" / "headset_walk.csv"
 
 
 def test_the_sample_is_fifteen_seconds_of_a_person_who_stands_and_then_walks():
-    recording = wearcap.read(str(SAMPLE), height=1.68)
+    recording = wearcap.read(str(SAMPLE), height=1.74)
     head = recording.head
     assert head is not None
     assert set(recording.tracked) == {"left_wrist", "right_wrist"}

@@ -106,6 +106,7 @@ def captured(config: Any, system: System) -> Motion | None:
             show(
                 f"knees: bent by {knee_deg:.0f}° where they bear weight while walking: is the height right? (height=…)"
             )
+        (folder / "gait.json").unlink(missing_ok=True)  # of an earlier capture into this folder
         if (gait := gait_report(motion)) is not None:
             write_text(folder / "gait.json", json.dumps(gait, indent=1) + "\n")
             show(f"gait: {gait['strides']} strides, gait.json")
@@ -206,6 +207,11 @@ class _Shown(Sink):
 
 def _live(system: System, config: DictConfig, folder: Path) -> None:
     """Follow a growing recording: the motion's files grow with it."""
+    if config.to_rig is not None:
+        fix = (
+            f"Afterwards: wearcap capture recording={folder}/wearer/motion.npz pipeline=recorded to_rig={config.to_rig}"
+        )
+        raise WearcapError("to_rig=… while a recording grows", expected="a whole recording", fix=fix)
     growing = Path(config.recording)
     if not growing.is_dir():
         raise WearcapError("no such folder", where=growing, expected="a growing recording: piece-000000.safetensors, …")

@@ -128,6 +128,12 @@ class FingerStream:
     """Rotations of the joints in the same axes, where the device measures them: of a flat hand in the T-pose all are those
     of the wrist joint (y along the left hand's fingers and against the right one's, z out of the back), in a wrist's rest axes."""
 
+    def frame(self, k: int) -> "FingerStream":
+        """The stream's frame k alone."""
+        row, rotations = slice(k, k + 1), self.rotations
+        turned = None if rotations is None else rotations[row]
+        return FingerStream(self.timestamps[row], self.points[row], self.valid[row], self.confidence[row], turned)
+
 
 @dataclass(frozen=True)
 class ContactTrack:

@@ -26,11 +26,11 @@ def with_walked_stature(
 ) -> tuple[CaptureInput, Stature]:
     """The recording with the height that its walk and the head's height together show, and that height.
 
-    The system captures the beginning at each of the `TRIED` heights. Without points of the floor, with fewer than `LEAST_CYCLES`
+    The system captures the beginning at each of the `TRIED` heights. Without points and a floor, with fewer than `LEAST_CYCLES`
     of walking, and for heights that are no estimate by the head's height, both are returned as they are.
     """
     recording = source.recording
-    if found.source != "head" or recording.points is None:
+    if found.source != "head" or (recording.points is None and recording.floor is None):
         return source, found
     beginning = first_seconds(recording, LOOKED_S)
     heights = [found.height_m + step * found.deviation_m for step in TRIED]

@@ -148,7 +148,9 @@ def _fit(
         free = (~held).double()
         square = J.mT @ J * free[..., None] * free[..., None, :] + prior
         step = torch.linalg.solve(square, gradient * free)
-        angles = (angles + step.clamp(-_STEP_RAD, _STEP_RAD)).clamp(low, high)
+        before, angles = angles, (angles + step.clamp(-_STEP_RAD, _STEP_RAD)).clamp(low, high)
+        if (angles - before).abs().max() < _STEP_RAD * 1e-5:
+            break
     chord = (seen - _directions(angles)[0]).norm(dim=-1)
     total = weight.sum((-1, -2))
     error = ((weight * (2 * (chord / 2).clamp(max=1).asin()).square()).sum((-1, -2)) / total.clamp_min(1)).sqrt()

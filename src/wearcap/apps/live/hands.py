@@ -8,8 +8,8 @@ from wearcap.recording import FingerStream
 from wearcap.sensors.samples import HandSample
 from wearcap.tracking.fingers import SHORT_S, FittedHand, fit_hand
 
-MAX_WAITING = 600
-"""Samples of a hand that may wait to be fitted."""
+MAX_WAITING = 3600
+"""Samples of a hand that may wait to be fitted: a piece of a minute."""
 
 
 class LiveHands:

@@ -41,6 +41,8 @@ class FilesSink(Sink):
             raise WearcapError(what, self.folder, "record=DIR") from error
 
     def begin(self, wearer: str, skeleton: Skeleton, fps: float) -> None:
+        if wearer in self._tracks and self._tracks[wearer].last_s is None:
+            return  # nothing came of the motion before: its folder is still empty
         self.end(wearer)
         self._tracks[wearer] = _Track(_own_folder(self.folder / plain_name(wearer)))
 

@@ -6,11 +6,13 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from wearcap.apps.live.packets import SUIT, Inbox, Packet
+from wearcap.apps.live.packets import HANDS, SUIT, Inbox, Packet
 from wearcap.apps.live.source import Address, Source
 from wearcap.errors import WearcapError
+from wearcap.recording import Recording
 from wearcap.recording.pieces import follow_pieces
 from wearcap.runtime.system import System
+from wearcap.sensors.samples import HandSample
 
 
 class PiecesSource(Source):
@@ -45,14 +47,25 @@ class PiecesSource(Source):
                 inbox.refused[f"{self.name}: {reason}"] += count
 
     async def _send(self, inbox: Inbox) -> None:
+        piece: Recording | None = self.first
         sample = self._sample
-        while True:
+        while piece is not None:
             if sample is not None and len(sample.suit):
                 sent_s = sample.suit.timestamps[0].item()
-                inbox.deliver([Packet(self.wearer, SUIT, self.name, sent_s, time.monotonic(), sample)])
+                packets = [Packet(self.wearer, SUIT, self.name, sent_s, time.monotonic(), sample)]
+                inbox.deliver(packets + self._hands(piece))
             while inbox.waiting:
                 await asyncio.sleep(0.01)
             piece = await asyncio.to_thread(next, self._pieces, None)
-            if piece is None:
-                return
-            sample = await asyncio.to_thread(self.kind.of_piece, self.system, piece, self.folder, self._refused)
+            if piece is not None:
+                sample = await asyncio.to_thread(self.kind.of_piece, self.system, piece, self.folder, self._refused)
+
+    def _hands(self, piece: Recording) -> list[Packet]:
+        """The packets of a piece's tracked hands."""
+        packets = []
+        for hand, side in HANDS.items():
+            if (stream := piece.fingers.get(side)) is not None:
+                for k, sent_s in enumerate(stream.timestamps.tolist()):
+                    sample = HandSample(side, sent_s, stream.frame(k))
+                    packets.append(Packet(self.wearer, hand, self.name, sent_s, time.monotonic(), sample))
+        return packets

@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from wearcap.apps.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet
+from wearcap.apps.live.packets import CAMERA, HANDS, HEAD, OBJECT, SUIT, Inbox, Packet
 from wearcap.apps.live.setup import Seat, Setup
 from wearcap.apps.live.source import Address, Source
 from wearcap.body.skeleton import WRISTS
@@ -18,10 +18,12 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import ImuStream, Motion, Recording
 from wearcap.recording.active_objects import SAME_S
+from wearcap.recording.recording import FingerStream
 from wearcap.runtime.session import Session
 from wearcap.sensors.imu import acceleration
 from wearcap.sensors.samples import (
     ActiveObject,
+    HandSample,
     HeadSample,
     LocalizationSample,
     ObjectSample,
@@ -65,6 +67,7 @@ class ReplaySource(Source):
         self.objects = list(objects)
         optional = [device for device in kind.optional if device in recording.tracked]
         self.streams = {device: self._stream(device, kind.tracks_wrists) for device in (*kind.devices, *optional)}
+        self.streams |= {hand: recording.fingers[side] for hand, side in HANDS.items() if side in recording.fingers}
 
     @property
     def name(self) -> str:
@@ -140,6 +143,8 @@ class ReplaySource(Source):
                 return WatchSample(stream.timestamps[k].item(), stream.R_world_imu[k], stream.acc_world[k], device)
             case Trajectory():
                 return WristSample(device, stream.timestamps[k].item(), stream.T_world_body[k])
+            case FingerStream():
+                return HandSample(HANDS[device], stream.timestamps[k].item(), stream.frame(k))
             case Motion():
                 return SuitPiece(stream.sliced(k, k + 1))
         time_s = stream.timestamps[k].item()
