@@ -6,7 +6,7 @@ from typing import Any
 
 import griffe
 
-NAME = re.compile(r"`(?:wearcap\.)?([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)`")
+NAME = re.compile(r"`([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)`")
 ARRAYS = ("Float", "Float32", "Float64", "Int", "Int64", "Bool", "UInt8", "Shaped")
 
 
@@ -26,7 +26,7 @@ class Names(griffe.Extension):
 def _linked(obj: griffe.Object, name: str) -> str:
     """A name as a link to what it names from an object's point of view; the site leaves out links to what it does not show."""
     try:
-        path = f"wearcap.{name}" if "." in name else obj.resolve(name)
+        path = name if name.startswith("wearcap.") else f"wearcap.{name}" if "." in name else obj.resolve(name)
     except griffe.NameResolutionError:
         return f"`{name}`"
     return f'<autoref identifier="{path}" optional><code>{name}</code></autoref>'

@@ -60,12 +60,13 @@ def save(motion, path, rig=None, keep_hands: bool = False) -> None:
         write_on_rig(motion, read_rig(rig), path, keep_hands)
 
 
-def show(motion, seconds: float = 10.0, fps: float = 15.0, size: tuple[int, int] = (360, 320), **beside):
+def show(motion=None, seconds: float = 10.0, fps: float = 15.0, size: tuple[int, int] = (360, 320), **labelled):
     """A video of a `recording.Motion` for a notebook, which shows it where it is the value of a cell (`apps.viewer.inline.Video`).
 
-    `beside` are further motions of the same moments, by their labels (truth=recording.motion), in panels of their own of `size`
-    (width, height, in pixels). It lasts `seconds` at most. Raises WearcapError for motions that share no time, and for odd sizes.
+    `labelled` are further motions of the same moments, or all of them, by their labels (truth=recording.motion). Each has a panel of
+    `size` (width, height, in pixels). The video lasts `seconds` at most. Raises WearcapError for no motion, for motions that share no
+    time, and for odd sizes.
     """
     from wearcap.apps.viewer.inline import Video
 
-    return Video.of({"motion": motion, **beside}, fps, size, seconds)
+    return Video.of(labelled if motion is None else {"motion": motion, **labelled}, fps, size, seconds)

@@ -19,7 +19,8 @@ class Video:
     @classmethod
     def of(cls, motions: dict[str, Motion], fps: float, size: tuple[int, int], max_seconds: float) -> "Video":
         """Motions by their labels side by side, as `write_video` draws them, on human surfaces. Raises WearcapError as it does."""
-        body = surface_or_sticks(next(iter(motions.values())).skeleton, {})
+        first = next(iter(motions.values()), None)
+        body = None if first is None else surface_or_sticks(first.skeleton, {})
         with TemporaryDirectory() as folder:
             path = Path(folder) / "motion.mp4"
             write_video(path, motions, fps=fps, size=size, body=body, max_seconds=max_seconds)
