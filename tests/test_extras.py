@@ -60,9 +60,16 @@ for verb, arguments in json.loads(sys.argv[1]).items():
         except SystemExit as ended:
             code = ended.code
     runs[verb] = [code, err.getvalue(), time.time() - began]
+import importlib, pkgutil, wearcap
+for name in ("hps", "ireplica", "hmd2", "mocap_every", "echo"):
+    wearcap.load(name)
+for package in ("wearsim", "data_prep"):
+    for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}."):
+        importlib.import_module(module.name)
 print(json.dumps(runs))
 """
-"""Runs verbs one after the other, and prints their exit codes and what they wrote to stderr."""
+"""Runs verbs one after the other, and prints their exit codes and what they wrote to stderr; then
+loads every system, and imports all that prepares and simulates."""
 
 
 @pytest.fixture(scope="module")

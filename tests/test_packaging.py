@@ -125,8 +125,8 @@ def unpacked(tmp_path_factory) -> Path:
     return folder / "site"
 
 
-def run(site: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess:
-    environment = os.environ | {"PYTHONPATH": str(site)}
+def run(site: Path, cwd: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": str(site)} | variables
     return subprocess.run(
         [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, check=False
     )
@@ -162,6 +162,13 @@ def test_the_command_works_from_the_wheel(unpacked, tmp_path):
     count, file = run(unpacked, tmp_path, "-c", listed).stdout.split()
     assert int(count) == len(list((ROOT / "checkpoints").glob("*.safetensors")))
     assert file == str(unpacked / "wearcap/_resources/checkpoints" / FIRST)
+    lacking = run(unpacked, tmp_path, "-m", "wearcap.cli.main", "evaluate", "hmd2", WEARCAP_WEIGHTS=str(tmp_path))
+    assert lacking.returncode == 2
+    assert re.fullmatch(
+        r"wearcap evaluate: .*: no hmd2\.safetensors in WEARCAP_WEIGHTS\. Download https\S+ into it\.\n", lacking.stderr
+    )
+    held = "from wearcap.models.checkpoint import read_checkpoint; print(read_checkpoint('hmd2')[0]['name'])"
+    assert run(unpacked, tmp_path, "-c", held, WEARCAP_WEIGHTS=str(ROOT / "checkpoints")).stdout == "hmd2\n"
     typo = run(unpacked, tmp_path, "-m", "wearcap.cli.main", "train", "data=smulated")
     assert typo.returncode == 2
     assert "Did you mean 'simulated'" in typo.stderr
