@@ -31,7 +31,7 @@ STEP_M = 0.25
 
 
 def walking(motion: Motion, floor: Float[Tensor, "time"]) -> Bool[Tensor, "time"]:
-    """Frames in which somebody walks on the floor, by the pelvis' way within a second, with the trunk upright."""
+    """Frames in which somebody walks on the floor, by the pelvis' displacement within a second, with the trunk upright."""
     half = max(round(0.5 * motion.fps), 1)
     pelvis, head = motion.joint("pelvis").t, motion.joint("head").t
     frame = torch.arange(len(motion))

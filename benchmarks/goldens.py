@@ -67,7 +67,7 @@ DATA = {
     "embedded": ("embeddings", "dataset=data/walkers", "encoder=egoview"),
     "keyed": ("keypoints", "dataset=data/walkers", "detector=simulated"),
 }
-"""Data sets by name: what `wearcap prepare` is asked for."""
+"""Data sets by name: what `wearcap prepare` is given."""
 
 SHARED = ("pipeline.synchronization.clock=shared",)
 """The session's camera has no sound to hear claps in: its clock is used as it is, though it is early."""

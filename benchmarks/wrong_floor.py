@@ -1,4 +1,4 @@
-"""HMD² and MocapEvery that are told a floor which is too low or too high by some centimetres.
+"""HMD² and MocapEvery that are given a floor which is too low or too high by some centimetres.
 
     python benchmarks/wrong_floor.py [--dataset datasets/cmu] [--split val] [--checkpoints hmd2 mocap_every] [--off -5 0 5]
 
@@ -27,14 +27,14 @@ SETTINGS = {"hmd2": {"": []}, "mocap_every": {"follows": ["pipeline.floor=follow
 SHOWN = ("mpjpe_cm", "lower_pe_cm", "foot_pe_cm", "floor_penetration_cm", "stance_knee_deg", f"{TRUTH}stance_knee_deg")
 
 
-def told(recording: Recording, off_m: float) -> Recording:
+def shifted_floor(recording: Recording, off_m: float) -> Recording:
     """The recording with its floor shifted, and without points, which would show the true one."""
     assert recording.floor is not None
     floor = FloorTrack(recording.floor.timestamps, recording.floor.height + off_m)
     return replace(recording, floor=floor, points=None, camera=None)
 
 
-def over_told_floor(found: Callable[..., HeadPath]) -> Callable[..., HeadPath]:
+def over_stated_floor(found: Callable[..., HeadPath]) -> Callable[..., HeadPath]:
     """`head_path` with the floor that the recording states."""
 
     def path_of(recording: Recording, *args: Any) -> HeadPath:
@@ -61,9 +61,9 @@ def main() -> None:
             system = load_pipeline(checkpoint, compose("capture", chosen).pipeline, "cpu")
             for off_cm in options.off:
                 rows = []
-                with patch.object(hmd2, "head_path", over_told_floor(hmd2.head_path)):
+                with patch.object(hmd2, "head_path", over_stated_floor(hmd2.head_path)):
                     for recording in recordings:
-                        source = CaptureInput.in_dataset(told(recording, off_cm / 100), store.root)
+                        source = CaptureInput.in_dataset(shifted_floor(recording, off_cm / 100), store.root)
                         rows.append(system.score(system(source), source, 0))
                 scores = aggregate(rows)
                 shown = ", ".join(f"{name} {scores[name].mean:.2f}" for name in SHOWN if name in scores)

@@ -99,7 +99,7 @@ class HpsScores:
     """Scores of one capture; NaN where there was nothing to measure."""
 
     literal: tuple[Chamfer, ...]
-    """Chamfer distance of each interval between vertices and points, both ways, as in the thesis."""
+    """Chamfer distance of each interval between vertices and points, in both directions, as in the thesis."""
     surface: tuple[Chamfer, ...]
     """Chamfer distance of each interval with points measured to the body's surface (ours)."""
     feet: FootSurface

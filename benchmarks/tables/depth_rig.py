@@ -108,7 +108,7 @@ class _Registration:
     rmse_m: float
     """Root mean square distance of those to the scene's local plane."""
     least_seen: float
-    """Share of surface (0 … 1/3) that faces the direction least faced: near 0 the cloud can slide that way."""
+    """Share of surface (0 … 1/3) that faces the direction least faced: near 0 the cloud can slide in it."""
     converged: bool
 
     @property

@@ -1,8 +1,8 @@
 """The object encoder on generated objects it was not trained on (test seeds): what its feature tells.
 
-Category by the network's own head: of objects as they are, turned about the vertical, and turned in any way. Extents:
+Category by the network's own head: of objects as they are, turned about the vertical, and turned about any axis. Extents:
 mean error of the half extents along the axes, as a share of the cloud's radius. Found again: the same object turned
-in any way, as nearest by the projected feature among all of the test. Beside it the nearest training object by
+about any axis, as nearest by the projected feature among all of the test. Beside it the nearest training object by
 its half extents in metres, which knows the size, whereas the encoder does not. Speed: milliseconds per cloud of one core, one at a time.
 """
 
@@ -22,7 +22,7 @@ from wearcap.models.point_encoder import bounds, to_unit_sphere
 from wearcap.systems.echo.object_training import CloudAugmentation, ObjectEncoding
 from wearsim.places.object_clouds import generate_clouds
 
-VIEWS = {"as it is": None, "about the vertical": 0.0, "in any way": 1.0}
+VIEWS = {"as it is": None, "about the vertical": 0.0, "about any axis": 1.0}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +54,7 @@ def milliseconds(system: ObjectEncoding, clouds: Float[Tensor, "batch point 3"])
 
 
 def scored(system: ObjectEncoding, clouds: Tensor, labels: Tensor) -> tuple[dict[str, dict[str, float]], Tensor]:
-    """Scores by view, and the confusion of views turned in any way (rows: true)."""
+    """Scores by view, and the confusion of views turned about any axis (rows: true)."""
     rows, projected, predicted = {}, {}, labels
     for name, turned in VIEWS.items():
         seen = views(clouds, turned)
@@ -96,7 +96,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     speed = milliseconds(system, clouds)
     console = Console(width=120)
     console.print(table)
-    console.print(f"turned in any way, taken for others: {confused}\n{speed:.1f} ms per cloud")
+    console.print(f"turned about any axis, taken for others: {confused}\n{speed:.1f} ms per cloud")
     path = options.output / "objects.json"
     content = about | {
         "objects": len(clouds),

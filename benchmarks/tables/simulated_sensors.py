@@ -247,7 +247,7 @@ def head_errors(motion: Motion, noise: SlamNoise, rng: np.random.Generator) -> V
     stream = head_stream(motion, torch.zeros(3), noise, rng)
     true = motion.joint("head")
     off = (stream.t_world_device - true.t).double()
-    way = true.t.diff(dim=0).norm(dim=-1).sum().item()
+    path_m = true.t.diff(dim=0).norm(dim=-1).sum().item()
     second = round(motion.fps)
     quick = (
         off
@@ -259,7 +259,7 @@ def head_errors(motion: Motion, noise: SlamNoise, rng: np.random.Generator) -> V
         "jitter_deg": (angle.square().mean() / 3).sqrt().item(),
         "head_cm": 100 * off.square().sum(-1).mean().sqrt().item(),
         "head_deg": angle.square().mean().sqrt().item(),
-        "drift_percent": 100 * (off[-second:].mean(0) - off[:second].mean(0)).norm().item() / way,
+        "drift_percent": 100 * (off[-second:].mean(0) - off[:second].mean(0)).norm().item() / path_m,
     }
 
 

@@ -1,6 +1,6 @@
 """A head tracker and two watches as people wear them: presets of their errors, and what they sense of a true motion.
 
-"typical": a headset with visual-inertial SLAM such as Aria or Quest (millimetres of jitter, drift below 0.5 % of the way,
+"typical": a headset with visual-inertial SLAM such as Aria or Quest (millimetres of jitter, drift below 0.5 % of the path,
 gravity known), and calibrated smartwatches (attitude 1 to 2°, some degrees of heading in ten minutes, a strap that is 3°
 off and gives as much, clocks that agree to half a frame at 30 Hz by arm swings); wrists by controllers that are held, or
 trackers that are strapped, 1 cm and 3° off (our assumption: we know of no published figure). "poor": heads as MocapEvery's paper

@@ -236,7 +236,7 @@ class WristHeights(ConditionWindows):
 
 
 def test_a_new_condition_takes_a_class_a_reader_and_a_config(data, tmp_path, monkeypatch):
-    """The places of docs/hmd2.md: it is trained with, captured with and exported."""
+    """The places of the system's README: it is trained with, captured with and exported."""
     monkeypatch.setitem(CONDITIONS, "wrist", WristHeight)
     windows = f"+surroundings.windows.wrist={{_target_:{__name__}.WristHeights}}"
     given = ["surroundings=head", windows, "+surroundings.network.wrist={size:1,drop:0.5}", "callbacks.capture=null"]

@@ -121,7 +121,7 @@ class Cut:
     def between(
         self, sensed: bool = False
     ) -> tuple[Int64[Tensor, "time"], Int64[Tensor, "time"], Float[Tensor, "time"]]:
-        """The frames before and after every position, and its share of the way between them."""
+        """The frames before and after every position, and its fraction between them."""
         origin, place = self.place
         last = self.length - 1 - origin
         if sensed and self.kept is not None:

@@ -1,6 +1,6 @@
 """HMD²'s conditions beside the head's path: what the system knows of one of them stands in its class.
 
-A condition has features per frame, and any frame may lack them. docs/hmd2.md shows how to add one.
+A condition has features per frame, and any frame may lack them. The README beside this file shows how to add one.
 """
 
 from collections.abc import Sequence
