@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.wearcap-installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-real lint format lock addon site site-serve clean
+.PHONY: help install demo test test-real lint format lock registry release addon site site-serve clean
 
 help:
 	@echo "make demo       prepare simulated data, train, evaluate, capture, export (about 2 minutes on 2 quiet cores)"
@@ -13,16 +13,18 @@ help:
 	@echo "make test-real  the tests on real recordings (../shared/data, or WEARCAP_REAL_DATA)"
 	@echo "make format     let ruff mend what it can"
 	@echo "make lock       write requirements.lock from a clean environment"
+	@echo "make registry   checkpoints/registry.json from the files beside it"
+	@echo "make release    check, build and try a release, and print the commands that publish it"
 	@echo "make addon      dist/wearcap_blender.zip, the Blender add-on"
 	@echo "make site       build/site, the documentation with its notebooks executed; make site-serve shows it while it is written"
 	@echo "make clean      remove $(VENV)"
-	@echo "PYTHON=python3.12 make demo  takes another interpreter (3.11 or 3.12)"
+	@echo "PYTHON=python3.12 make demo  takes another interpreter (3.11 to 3.13)"
 
 install: $(STAMP)
 
 $(STAMP): pyproject.toml requirements.lock
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' || { \
-	  echo "wearcap needs Python 3.11 or 3.12, but '$(PYTHON)' is $$($(PYTHON) --version 2>&1). Try: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12), (3, 13)))' || { \
+	  echo "wearcap needs Python 3.11 to 3.13, but '$(PYTHON)' is $$($(PYTHON) --version 2>&1). Try: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { \
 	  echo "Python's venv is missing (Debian: apt install python3-venv)." >&2; rm -rf $(VENV); exit 1; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
@@ -55,6 +57,13 @@ lock:
 	  | grep -v -E '^(nvidia-|triton|cuda-)' | sed 's/+cpu$$//' | sort -f; } > requirements.lock.new
 	mv requirements.lock.new requirements.lock
 	rm -rf $(VENV)-lock
+
+registry: $(STAMP)
+	$(BIN)/python -m release.registry
+
+release: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'build>=1.3' 'twine>=6.1'
+	$(BIN)/python -m release
 
 addon:
 	mkdir -p dist

@@ -12,6 +12,7 @@ from PIL import Image
 
 from wearcap.boundary.opening import file_size
 from wearcap.errors import WearcapError
+from wearcap.extras import missing
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.aria_mps import R_CPF_DEVICE, T_HEAD_DEVICE
@@ -101,8 +102,7 @@ def extract_video(
 def _open(path: str | Path):
     """Data provider of projectaria-tools. Raises WearcapError that names what is missing."""
     if data_provider is None:
-        what = "reading VRS recordings needs projectaria-tools"
-        raise WearcapError(what, path, fix='Install it with `pip install "wearcap[aria]"` (about 1 GB).')
+        raise missing("projectaria_tools", "reading VRS recordings (the package has about 1 GB)")
     file_size(path)
     provider = data_provider.create_vrs_data_provider(str(path))
     if provider is None:

@@ -5,7 +5,6 @@ Recorded keypoints are CSV: timestamp (s), joint, x, y (pixels) or x, y, z (m, i
 joint at one time, in any order. A file holds pixels or 3D positions, not both.
 """
 
-import importlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -19,6 +18,7 @@ from jaxtyping import Float, UInt8
 from wearcap.body.hands import MEDIAPIPE, in_layout
 from wearcap.body.skeleton import SIDES
 from wearcap.errors import WearcapError
+from wearcap.extras import required
 from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.recording.recording import Cue, FingerStream
 
@@ -108,11 +108,7 @@ class MediaPipeHands:
 
         Raises WearcapError when the package or the model is missing, or the model is no such file.
         """
-        try:
-            self._mediapipe = importlib.import_module("mediapipe")
-        except ModuleNotFoundError as error:
-            fix = 'pip install "wearcap[hands]", or take detector=recorded, which needs none.'
-            raise WearcapError(f"MediaPipe's hands need the package {error.name!r}", fix=fix) from error
+        self._mediapipe = required("mediapipe", "detector=mediapipe", "take detector=recorded, which needs none")
         self._seen: list[tuple[float, dict[str, _Hand]]] = []
         vision, path = self._mediapipe.tasks.vision, find_model(model)
         options = vision.HandLandmarkerOptions(

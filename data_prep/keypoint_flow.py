@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, UInt8
@@ -18,8 +17,11 @@ from torch import Tensor
 
 from data_prep.keypoint_detectors import Detector, Keypoint
 from wearcap.errors import WearcapError
+from wearcap.extras import at_first_use
 from wearcap.localization.landmark_tracking import flow_there_and_back
 from wearcap.recording.recording import Cue
+
+cv2 = at_first_use("cv2", "keypoints' optical flow")
 
 APART_AT_MOST = 4.0
 """Multiple of `apart_px` beyond which two tracks do not follow the same point."""

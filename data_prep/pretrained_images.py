@@ -4,7 +4,6 @@ Nothing is downloaded: weights of CLIP and DINOv2 come from a path, an environme
 programs left them. Their networks are open_clip's and timm's, both optional packages.
 """
 
-import importlib
 import os
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from wearcap.errors import WearcapError
+from wearcap.extras import required
 from wearcap.models.image_encoder import fingerprint_of, letterboxed
 from wearcap.models.weights import load_weights, read_weights
 
@@ -30,8 +30,6 @@ class _PretrainedEncoder:
     size: ClassVar[int]
     title: ClassVar[str]
     package: ClassVar[str]
-    install: ClassVar[str]
-    """Name of the package for pip."""
     mean: ClassVar[tuple[float, float, float]]
     std: ClassVar[tuple[float, float, float]]
     variable: ClassVar[str]
@@ -48,11 +46,7 @@ class _PretrainedEncoder:
 
         Raises WearcapError when the package or the weights are missing, or the weights are another network's.
         """
-        try:
-            package = importlib.import_module(self.package)
-        except ModuleNotFoundError as error:
-            fix = f"pip install {self.install}, or take encoder=egoview, which needs none."
-            raise WearcapError(f"{self.title} needs the package {error.name!r}", fix=fix) from error
+        package = required(self.package, self.title, "take encoder=egoview, which needs none")
         path = self.find_weights(weights)
         network = self.network_of(package)
         load_weights(network, self.tensors_of(read_weights(path)), name=self.title, where=path)
@@ -111,7 +105,7 @@ class Clip(_PretrainedEncoder):
     """CLIP ViT-L/14 as OpenAI published it (768-d, the thesis's choice)."""
 
     name, title, size = "clip-vit-l14", "CLIP ViT-L/14", 768
-    package, install = "open_clip", "open_clip_torch"
+    package = "open_clip"
     mean, std = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
     variable, elsewhere = "WEARCAP_CLIP_WEIGHTS", "clip/ViT-L-14.pt"
     hub = "timm/vit_large_patch14_clip_224.openai"
@@ -131,7 +125,7 @@ class DinoV2(_PretrainedEncoder):
     """DINOv2 ViT-L/14 (1024-d, the class token)."""
 
     name, title, size = "dinov2-vit-l14", "DINOv2 ViT-L/14", 1024
-    package = install = "timm"
+    package = "timm"
     mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
     variable, elsewhere = "WEARCAP_DINOV2_WEIGHTS", "torch/hub/checkpoints/dinov2_vitl14_pretrain.pth"
     hub = "timm/vit_large_patch14_dinov2.lvd142m"

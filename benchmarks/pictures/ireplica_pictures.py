@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from benchmarks.tables.ireplica_runs import Case, pipeline_of
-from wearcap.apps.viewer.page_layers import with_objects
 from wearcap.apps.viewer.picture import contact_sheet, save_png
+from wearcap.apps.viewer.shown import with_objects
 from wearcap.body.anny_body import anny_body
 from wearcap.metrics.objects import handlings
 from wearcap.recording import Motion, RecordingStore

@@ -25,7 +25,8 @@ import torch
 from hydra.utils import instantiate
 
 from benchmarks.speed.adam import WITHIN, Run, Schedule, compared, least, reach
-from wearcap.body.anny_body import anny_body
+from data_prep.free_body import read_assets
+from wearcap.body.anny_body import body_of
 from wearcap.cli.conf import compose
 from wearcap.geometry import rotation
 from wearcap.geometry.surface import SurfaceIndex
@@ -122,7 +123,7 @@ def authors_energy() -> HpsEnergy:
     return instantiate(config.pipeline.energy, _convert_="all")
 
 
-def walk(duration_s: float, vertices: int | None = None, seed: int = 3) -> HpsData:
+def walk(duration_s: float, seed: int = 3) -> HpsData:
     """A simulated wearer's suit on a scanned floor, localised to 5 cm and 1°."""
     rng = np.random.default_rng(seed)
     config = SimulationConfig(duration_s=duration_s, fps=FPS, points=False, world="flat", activities=("walk", "stand"))
@@ -140,7 +141,7 @@ def walk(duration_s: float, vertices: int | None = None, seed: int = 3) -> HpsDa
     floor = np.column_stack([rng.uniform(low - 1.5, high + 1.5, (count, 2)), rng.normal(0, 0.002, count)])
     assert suit.contact_prob is not None
     return HpsData(
-        FootPatches.of(anny_body(suit.skeleton, recording.shape, vertices)),
+        FootPatches.of(body_of(read_assets(None), suit.skeleton, recording.shape or {})),
         HpsState(rotation.log(R[:, 1:]), R[:, 0], t),
         torch.eye(3, dtype=torch.float64),
         R_cam,

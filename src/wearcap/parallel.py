@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from wearcap.errors import WearcapError, require_choice
+from wearcap.extras import missing
 from wearcap.workers import bound_to_this_process
 
 BACKENDS = ("loky", "threading", "dask", "ray")
@@ -98,9 +99,7 @@ class Parallel:
                 with joblib.parallel_config(self.backend):
                     yield True
         except ModuleNotFoundError as error:
-            fix = f"pip install {'wearcap[cluster]' if self.backend == 'dask' else 'ray'}"
-            what = f"the backend {self.backend!r} needs the package {error.name!r}"
-            raise WearcapError(what, fix=fix) from error
+            raise missing(error.name or self.backend, f"the backend {self.backend!r}") from error
 
 
 def reason_of(error: Exception) -> str:

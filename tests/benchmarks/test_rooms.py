@@ -22,6 +22,7 @@ MODULES = [
 ]
 KEYS = list(figure("", 0.0, "", 0.0, 0.0, None))
 SMALLEST: dict[str, dict] = {
+    "capture_runtimes": {"duration_s": 4.0, "rounds": 1, "systems": ("mocap_every",)},
     "carried_heads": {"folders": ()},
     "contact_seconds_per_minute": {"seconds": 2.0, "rounds": 1},
     "contact_sequence_vs_window": {"seconds": 1.0, "rounds": 1},

@@ -196,7 +196,7 @@ def test_missing_library_and_wrong_names_are_reported(tmp_path, monkeypatch):
     with pytest.raises(WearcapError, match=r"ends in \.pt2"):
         files.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.onnx", "pt2", 1e-4)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(WearcapError, match=r'onnxscript.*pip install "wearcap\[export\]"'):
+    with pytest.raises(WearcapError, match=r'onnx.*pip install "wearcap\[export\]"'):
         files.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.onnx", "onnx", 1e-4)
 
 

@@ -18,10 +18,10 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage
 from ports import free_port
 from silent_sockets import silent
 from wearcap.apps.live import capture
+from wearcap.apps.live.files_sink import FilesSink
 from wearcap.apps.live.packets import Packet
 from wearcap.apps.live.sink import SinkThread
-from wearcap.apps.live.sinks import files, sink_of
-from wearcap.apps.live.sinks.files import FilesSink
+from wearcap.apps.live.sinks import sink_of
 from wearcap.apps.live.source import Budget
 from wearcap.apps.live.sources import source_of
 from wearcap.apps.web import connections
@@ -227,7 +227,7 @@ def test_a_full_disk_ends_a_capture_with_an_error(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(files, "write_motion", full)
+    monkeypatch.setattr(files_sink, "write_motion", full)
     save_recording(recording_of(swaying_motion(200, 0), "sway"), tmp_path / "in.safetensors")
     command = ["system=hmd2", "source=replay", f"recording={tmp_path / 'in.safetensors'}", "speed=inf", "to=[]"]
     command += [f"record={tmp_path / 'out'}", f"report={tmp_path / 'report.json'}", f"hydra.run.dir={tmp_path}"]

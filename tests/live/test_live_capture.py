@@ -29,11 +29,11 @@ from small_hmd2 import hmd2_of
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.apps.live import wearer as wearer_module
 from wearcap.apps.live.capture import LiveCapture, report_text
+from wearcap.apps.live.files_sink import FilesSink, join_sections
 from wearcap.apps.live.packets import HEAD, Inbox, Packet
 from wearcap.apps.live.setup import Known, Seat, Setup, plain_name
 from wearcap.apps.live.sink import Sink, SinkThread
 from wearcap.apps.live.sinks import sink_of
-from wearcap.apps.live.sinks.files import FilesSink, join_sections
 from wearcap.apps.live.sinks.vmc import BONES, VmcSink
 from wearcap.apps.live.sinks.websocket import WebSocketSink
 from wearcap.apps.live.source import Address, Source
@@ -373,7 +373,7 @@ def test_the_files_of_a_killed_capture_open_and_lack_at_most_a_second(tmp_path: 
     script = f"""
 import sys, time
 sys.path[:0] = {[str(Path(__file__).parents[1])]!r}
-from wearcap.apps.live.sinks.files import FilesSink
+from wearcap.apps.live.files_sink import FilesSink
 from pathlib import Path
 from dataclasses import replace
 from wearcap_testing import swaying_motion

@@ -17,11 +17,11 @@ from websockets.sync.client import connect
 from ports import free_port
 from wearcap.apps.live.capture import LiveCapture
 from wearcap.apps.live.devices import Device
+from wearcap.apps.live.files_sink import FilesSink, join_sections
 from wearcap.apps.live.packets import MAX_POINTS_WAITING, Inbox, Packet
 from wearcap.apps.live.setup import Known, plain_name, read_setup, write_setup
 from wearcap.apps.live.sink import SinkThread
 from wearcap.apps.live.sinks import sink_of
-from wearcap.apps.live.sinks.files import FilesSink, join_sections
 from wearcap.apps.live.sinks.websocket import WebSocketSink
 from wearcap.apps.live.source import Address, Budget, Source
 from wearcap.apps.live.sources.replay import ReplaySource

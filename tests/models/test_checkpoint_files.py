@@ -12,10 +12,17 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
 
+from release.registry import registry
 from wearcap.errors import WearcapError
 from wearcap.models import checkpoint as module
 from wearcap.models.build import brought_up_to_date, build
-from wearcap.models.checkpoint import load_trained, read_checkpoint, share_checkpoint, shared_checkpoints
+from wearcap.models.checkpoint import (
+    checkpoint_file,
+    load_trained,
+    read_checkpoint,
+    share_checkpoint,
+    shared_checkpoints,
+)
 from wearcap.models.weights import check_weights
 
 pytestmark = pytest.mark.usefixtures("trusted")
@@ -117,6 +124,7 @@ def test_what_cannot_be_shared_so_is_reported(tmp_path):
 
 def test_a_bare_name_is_a_checkpoint_of_the_project_unless_a_file_has_it(tmp_path, monkeypatch):
     share_checkpoint(run_file(tmp_path / "run.ckpt"), tmp_path / "comes_with/walker.safetensors")
+    (tmp_path / "comes_with/registry.json").write_text(registry(tmp_path / "comes_with"))
     monkeypatch.setattr(module, "resource", lambda *_: tmp_path / "comes_with")
     monkeypatch.chdir(tmp_path)
     assert read_checkpoint("walker")[0]["name"] == "toy"
@@ -270,7 +278,7 @@ def test_a_flipped_bit_anywhere_in_weights_or_config_is_refused(kind, tmp_path):
 
 def former_model(name: str) -> dict:
     """The model's config as a shared checkpoint's file has it."""
-    with safe_open(str(shared_checkpoints()[name]), "pt") as file:
+    with safe_open(str(checkpoint_file(name)), "pt") as file:
         return json.loads(file.metadata()["wearcap_checkpoint"])["model"]
 
 

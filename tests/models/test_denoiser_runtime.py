@@ -124,5 +124,5 @@ def test_without_onnx_runtime_auto_is_eager_and_onnx_is_refused(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     net = network()
     assert worst(net, StepRunner(net, LEVELS, "auto", "narrowest"), 1) < 1e-5
-    with pytest.raises(WearcapError, match="needs onnx"):
+    with pytest.raises(WearcapError, match="needs the package .onnx"):
         StepRunner(net, LEVELS, "onnx")

@@ -24,7 +24,7 @@ MAX_BYTES = 50_000_000
 def test_a_checkpoint_and_its_card_come_together():
     assert set(CONTACTS) <= set(shared_checkpoints())
     assert {path.stem for path in FOLDER.glob("*.md")} == set(shared_checkpoints())
-    assert {path.suffix for path in FOLDER.iterdir()} == {".md", ".safetensors"}
+    assert {path.suffix for path in FOLDER.iterdir()} == {".json", ".md", ".safetensors"}
 
 
 @pytest.mark.parametrize("name", shared_checkpoints())

@@ -24,8 +24,9 @@ from wearcap.systems.ireplica.contact_sequence import ContactSequence
 from wearcap.systems.ireplica.features import HandViews
 from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
-from wearcap.systems.ireplica.training import ContactDetection, IReplicaValidation, fit
+from wearcap.systems.ireplica.training import ContactDetection
 from wearcap.systems.ireplica.training_windows import ContactContent
+from wearcap.systems.ireplica.validation import IReplicaValidation, fit
 from wearcap.training.base import Optimization
 
 

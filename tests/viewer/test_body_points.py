@@ -9,21 +9,19 @@ from PIL import Image
 
 from boxes import box_mesh
 from wearcap.apps.viewer.page import FLESH_M, Page, _spacing_m
-from wearcap.apps.viewer.page_layers import (
+from wearcap.apps.viewer.picture import _actors, contact_sheet
+from wearcap.apps.viewer.shown import (
     BALL_M,
     BRIGHT,
     DIM,
-    TOUCH_M,
-    _lit_color,
     _true_body_contact,
     lit_points,
     poses_at,
     stick_body,
     with_objects,
 )
-from wearcap.apps.viewer.picture import _actors, contact_sheet
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, contact_points
+from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, TOUCH_M, contact_points
 from wearcap.cli import render as render_verb
 from wearcap.cli.view import main as view
 from wearcap.cli.view import read_motions
@@ -104,7 +102,7 @@ def test_only_what_is_likelier_than_not_is_lit_and_the_surer_the_brighter():
     assert len(lit_points(points, motion, 0).vertices) % 7 == 0
     assert lit_points(points, touching(motion, prob=0.5), 0) is None
     assert lit_points(points, swaying_motion(2), 0) is None
-    colors = _lit_color(torch.tensor([0.5, 0.75, 1.0]))
+    colors = lit_color(torch.tensor([0.5, 0.75, 1.0]))
     np.testing.assert_allclose(colors, [DIM, (DIM + BRIGHT) / 2, BRIGHT])
 
 

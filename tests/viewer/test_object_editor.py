@@ -14,7 +14,7 @@ from scanned_room import CHAIR, DOOR_X, DOOR_Y, SOFA, scanned_room
 
 from wearcap.apps.scene_editor.editor import ObjectEditor
 from wearcap.apps.scene_editor.view import HINTS, TOOLS, _typical_spacing
-from wearcap.apps.viewer.page_layers import by_height
+from wearcap.apps.viewer.shown import by_height
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment, write_environment

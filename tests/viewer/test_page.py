@@ -8,7 +8,8 @@ import torch
 import trimesh
 
 from wearcap.apps.viewer.page import CAPTURE_COLOR, Page, _Timeline
-from wearcap.apps.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
+from wearcap.apps.viewer.page_layers import AIR_COLOR, CONTACT_COLOR
+from wearcap.apps.viewer.shown import nearest_frame, stick_body, surface_or_sticks
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
 from wearcap.cli.view import main as view
 from wearcap.errors import WearcapError

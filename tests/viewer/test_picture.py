@@ -8,8 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from wearcap.apps.viewer.page_layers import GUESSED_COLOR, GUESSED_M, stick_body, vertex_colors
 from wearcap.apps.viewer.picture import SKY, contact_sheet, draw_head_path, save_png, shared_frames, write_video
+from wearcap.apps.viewer.shown import GUESSED_COLOR, GUESSED_M, stick_body, vertex_colors
 from wearcap.cli import render as render_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh

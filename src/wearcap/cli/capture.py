@@ -16,10 +16,10 @@ from rich.progress import track
 from torch import Tensor
 
 from wearcap.apps.live.capture import LiveCapture
+from wearcap.apps.live.pieces_source import PiecesSource
 from wearcap.apps.live.sink import Sink
-from wearcap.apps.live.sources.pieces import PiecesSource
-from wearcap.apps.viewer.page_layers import with_objects
 from wearcap.apps.viewer.picture import contact_sheet, save_png, write_video
+from wearcap.apps.viewer.shown import with_objects
 from wearcap.body.anny_body import anny_body
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import xsens23

@@ -10,8 +10,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from rich import get_console
 from rich import print as show
 
-from wearcap.apps.viewer.page_layers import with_objects
 from wearcap.apps.viewer.picture import contact_sheet, save_png
+from wearcap.apps.viewer.shown import with_objects
 from wearcap.cli.conf import (
     hydra_application,
     load_systems,

@@ -14,6 +14,7 @@ from wearcap.boundary.limits import VARIABLE, gib_bytes
 from wearcap.boundary.own import trusting
 from wearcap.cli.verbs import VERBS, conf_dir, help_of, overrides
 from wearcap.errors import WearcapError, nearest
+from wearcap.extras import check_verb
 from wearcap.version import __version__
 
 USER_ERROR, INTERRUPTED = 2, 130
@@ -54,6 +55,7 @@ def run_verb(verb: str, arguments: list[str], application: Callable[[], Any] | N
             module, arguments = "scene_edit", arguments[1:]
         elif (conf_dir() / f"{verb}.yaml").is_file():
             arguments = overrides(verb, arguments)
+        check_verb(module)
         with trusting(trust):
             importlib.import_module(f"wearcap.cli.{module}").main(arguments, *([application] if application else []))
         return 0

@@ -21,8 +21,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--environment", help="objects to draw (default: what the recording names)")
     options = parser.parse_args(arguments)
 
-    from wearcap.apps.viewer.page_layers import with_objects
     from wearcap.apps.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video
+    from wearcap.apps.viewer.shown import with_objects
     from wearcap.body.anny_body import anny_body
     from wearcap.reading import read
     from wearcap.recording.store import dataset_folder

@@ -166,8 +166,9 @@ def settings_key(config: dict[str, Any], checkpoints: Sequence[str | Path], *mod
         if key == "_target_" and parts[0] == "wearcap":
             targets.add(".".join(part for part in parts[:-1] if not part[:1].isupper()))
     named = [value for key, value in values if isinstance(value, str) and key != "_target_"]
+    shared = shared_checkpoints()
     files = [Path(value) for value in named if len(value) < 1000 and Path(value).is_file()]
-    files += [shared_checkpoints()[value] for value in named if value in shared_checkpoints()]
+    files += [checkpoint_file(value) for value in named if value in shared]
     used = [checkpoint_file(checkpoint) for checkpoint in checkpoints] + files
     sums = [remembered_sha256(path) for path in used]
     return digest(__version__, json.dumps(config, sort_keys=True), sums, code_digest(*targets))

@@ -16,6 +16,7 @@ import msgspec
 import torch
 from torch import Tensor, nn
 
+from wearcap import extras
 from wearcap.boundary.opening import file_size, understood
 from wearcap.boundary.own import remember_own, require_own
 from wearcap.boundary.tensors import read_tensors, write_tensors
@@ -183,7 +184,7 @@ def export_network(graph: Graph, path: str | Path, format: str, max_error: float
     if format not in RUN_BY_FORMAT:
         raise WearcapError(f"unknown export format {format!r}", expected=f"one of {', '.join(RUN_BY_FORMAT)}")
     if missing := missing_libraries() if format == "onnx" else []:
-        raise WearcapError(f"export to ONNX needs {', '.join(missing)}", fix='Run: pip install "wearcap[export]"')
+        raise extras.missing(missing[0], "export to ONNX")
     assert isinstance(graph.module, nn.Module)
     path, net = Path(path), copy.deepcopy(graph.module).cpu().eval()
     if path.suffix != f".{format}":

@@ -12,6 +12,7 @@ from wearcap.body.retarget import retarget
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.skeletons import smplh52
 from wearcap.errors import WearcapError, require_choice
+from wearcap.extras import required
 from wearcap.io.formats.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
@@ -35,11 +36,7 @@ def write_smplh(motion: Motion, path: Path) -> None:
 
 def usd_writer() -> Callable[..., None]:
     """`io.formats.usd.write_usd`. Raises WearcapError when the extra is missing."""
-    try:
-        from wearcap.io.formats.usd import write_usd
-    except ImportError as error:
-        raise WearcapError("USD files need the package usd-core", fix="Run: pip install 'wearcap[usd]'") from error
-    return write_usd
+    return required("wearcap.io.formats.usd", "USD files").write_usd
 
 
 def _write_with_surface(motion: Motion, path: Path) -> None:

@@ -1,17 +1,20 @@
 """Absolute camera pose: 2D-3D matches by descriptors, LO-RANSAC, refinement, covariance."""
 
 from dataclasses import dataclass
+from typing import Any
 
-import cv2
 import numpy as np
-import poselib
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.extras import at_first_use
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.compiled import compiled
+
+cv2 = at_first_use("cv2", "localisation")
+poselib = at_first_use("poselib", "localisation")
 
 _KEPT = 4
 """Number of best landmarks per keypoint that are kept for the ratio test."""
@@ -208,6 +211,6 @@ class Matches:
         return {"model": model, "width": camera.width, "height": camera.height, "params": params}
 
 
-def _fit(pose: poselib.CameraPose, inlier: np.ndarray) -> Fit:
+def _fit(pose: Any, inlier: np.ndarray) -> Fit:
     R_cam_world = np.asarray(pose.R)
     return Fit(R_cam_world.T.copy(), -R_cam_world.T @ np.asarray(pose.t), inlier)

@@ -6,12 +6,14 @@ The thesis uses this model (§4.3.3) without details; the selection and rejectio
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from wearcap.errors import WearcapError
+from wearcap.extras import at_first_use
 from wearcap.geometry.camera import Camera
+
+cv2 = at_first_use("cv2", "calibration")
 
 _SEARCH_WIDTH = 960
 """Width (pixels) to which images are reduced for the board search; corners are refined in the full image."""

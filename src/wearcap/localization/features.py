@@ -5,12 +5,14 @@ eq. 2.1), and the interfaces of extractors and matchers.
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from wearcap.errors import WearcapError
+from wearcap.extras import at_first_use
+
+cv2 = at_first_use("cv2", "localisation")
 
 
 @dataclass(frozen=True, eq=False)

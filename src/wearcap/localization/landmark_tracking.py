@@ -12,13 +12,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.extras import at_first_use
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.absolute_pose import CameraPose, Fit, Matches
@@ -26,6 +26,8 @@ from wearcap.localization.localizer import Localizer, confidence, counted, local
 from wearcap.localization.point_map import check_size, undistortion
 from wearcap.localization.pose_chain import ChainedPose, joined
 from wearcap.recording.recording import Localization
+
+cv2 = at_first_use("cv2", "tracking of landmarks")
 
 _AHEAD = 24
 """Number of frames that are decoded ahead while a key frame is localised."""
@@ -263,9 +265,9 @@ def flow_there_and_back(
     flow back takes them, and which are found both ways, within the picture."""
     options = {"winSize": (window_px, window_px), "maxLevel": levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     first = np.array(start if guess is None else guess)
-    end, there, _ = cv2.calcOpticalFlowPyrLK(before, after, start, first, **options)  # type: ignore[call-overload]
+    end, there, _ = cv2.calcOpticalFlowPyrLK(before, after, start, first, **options)
     first = np.array(end if guess is None else start)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, first, **options)  # type: ignore[call-overload]
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, first, **options)
     inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
     return end, np.linalg.norm(back - start, axis=-1), (there[:, 0] == 1) & (again[:, 0] == 1) & inside
 

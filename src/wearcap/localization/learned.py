@@ -3,12 +3,10 @@
 No weights come with wearcap or are downloaded, and the default needs none. Needs the extra: `pip install "wearcap[learned]"`.
 """
 
-import importlib
 import re
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from einops import rearrange
@@ -16,9 +14,12 @@ from jaxtyping import Int64, UInt8
 from torch import Tensor, nn
 
 from wearcap.errors import WearcapError
+from wearcap.extras import at_first_use, required
 from wearcap.files import sha256_of
 from wearcap.localization.features import Features
 from wearcap.models.weights import load_weights, read_weights
+
+cv2 = at_first_use("cv2", "localisation")
 
 _SMALLEST = 32  # pixels of the shorter side, below which the coarse maps have hardly a cell
 _DISK = "https://github.com/cvlab-epfl/disk (depth-save.pth)"
@@ -28,11 +29,7 @@ _FORMER = re.compile(r"^(self_attn|cross_attn)\.(\d+)\.")  # LightGlue's first r
 
 
 def _kornia() -> Any:
-    try:
-        return importlib.import_module("kornia.feature")
-    except ModuleNotFoundError as error:
-        fix = 'Run: pip install "wearcap[learned]", or take localization=sift, which needs none.'
-        raise WearcapError(f"learned features need the package {error.name!r}", fix=fix) from error
+    return required("kornia.feature", "DISK and LightGlue", "take localization=sift, which needs none")
 
 
 def _read(weights: str | Path | None, part: str, source: str) -> dict[str, Tensor]:

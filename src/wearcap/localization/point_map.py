@@ -6,17 +6,19 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from wearcap.errors import WearcapError
+from wearcap.extras import at_first_use
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.render import SplatCloud
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.features import Extractor, Features
 from wearcap.scene.scan import Scan
+
+cv2 = at_first_use("cv2", "localisation")
 
 
 @dataclass(frozen=True, eq=False)

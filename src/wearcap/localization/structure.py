@@ -4,7 +4,6 @@ All results are in one folder: `database.db` (features and matches), `sparse/` (
 that is finished, `model/`. A run that was stopped goes on where it was.
 """
 
-import importlib
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from wearcap.errors import WearcapError
+from wearcap.extras import required
 from wearcap.geometry.camera import Camera
 
 Advance = Callable[[str, int, int], None]
@@ -49,11 +49,7 @@ def map_pictures(
     if (folder / MODEL / "images.bin").is_file():
         return folder / MODEL
     lens = None if camera is None else colmap_camera(camera)
-    try:
-        colmap = importlib.import_module("pycolmap")
-    except ImportError as error:
-        fix = 'Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.'
-        raise WearcapError("structure from motion needs the package pycolmap", fix=fix) from error
+    colmap = required("pycolmap", "structure from motion", "give a finished COLMAP model: from_model=DIR")
     colmap.logging.minloglevel = 2  # its errors come as exceptions, we report its progress
     folder.mkdir(parents=True, exist_ok=True)
     _extract(colmap, names, images, folder / "database.db", lens, settings, advance)

@@ -1,7 +1,7 @@
 """Checkpoints that carry the config they were trained with, read without executing anything from them.
 
 Two kinds of file: a run's `.ckpt`, and the `.safetensors` that is shared: averaged weights and statistics, the model's
-config as JSON in the metadata. Those of `checkpoints/` go by name. The shared one carries a checksum that every reading verifies, and is for
+config as JSON in the metadata. Those of `checkpoints/registry.json` go by name. The shared one carries a checksum that every reading verifies, and is for
 others; a `.ckpt` is the user's own (`wearcap.boundary.own`).
 """
 
@@ -21,8 +21,10 @@ from wearcap.boundary.own import require_own
 from wearcap.boundary.tensors import plain_tensors, read_tensors, read_torch, write_tensors
 from wearcap.boundary.texts import parse_json, require_layout
 from wearcap.errors import WearcapError, nearest
+from wearcap.fetch import Remote, fetch
 from wearcap.files import resource
 from wearcap.models.build import brought_up_to_date, build, check_config
+from wearcap.version import __version__
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -36,9 +38,19 @@ _DIGEST = "sha256"
 """Key, beside the model's config, of the checksum of config and weights."""
 
 
-def shared_checkpoints() -> dict[str, Path]:
-    """Files of the checkpoints that come with the project, by name."""
-    return {path.stem: path for path in sorted(resource("checkpoints", "checkpoints").glob(f"*{_SUFFIX}"))}
+def shared_checkpoints() -> dict[str, Remote]:
+    """The checkpoints of the project's registry, by name. All are in a checkout; the wheel carries one, and the others are
+    fetched when they are first used."""
+    registry = json.loads((_folder() / "registry.json").read_text(encoding="utf-8"))
+    found = {}
+    for name, entry in registry["checkpoints"].items():
+        urls = tuple(url.format(version=__version__, name=name) for url in registry["urls"])
+        found[name] = Remote(f"{name}{_SUFFIX}", urls, f"sha256:{entry['sha256']}", entry["bytes"])
+    return found
+
+
+def _folder() -> Path:
+    return resource("checkpoints", "checkpoints")
 
 
 class _Source(TypedDict, total=False):
@@ -69,15 +81,18 @@ class _Config(TypedDict):
 
 
 def checkpoint_file(path: str | Path) -> Path:
-    """The file of a path, or of the name of a checkpoint in `checkpoints/`. Raises WearcapError for an unknown name."""
+    """The file of a path, or of the name of a shared checkpoint, which is fetched if it is not here. Raises WearcapError for an
+    unknown name, and as `fetch` does."""
     path = Path(path)
     if os.path.exists(path) or not _NAME.fullmatch(str(path)):
         return path
+    if os.path.isfile(here := _folder() / f"{path.name}{_SUFFIX}"):
+        return here
     shared = shared_checkpoints()
     if path.name not in shared:
         expected = "a file, or the name of a checkpoint that comes with wearcap"
         raise WearcapError("no such checkpoint", path.name[:80], expected, nearest(path.name[:80], shared))
-    return shared[path.name]
+    return fetch(shared[path.name])
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -21,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from wearcap import extras
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.boundary.opening import file_size
 from wearcap.diffusion.schedule import CosineSchedule, Schedule
@@ -38,7 +39,6 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 20)]
 """Frames, features and other sizes in a sidecar."""
 Rate = Annotated[float, msgspec.Meta(gt=0, le=10_000)]
 """Frame rate (Hz) in a sidecar."""
-_INSTALL = 'Run: pip install "wearcap[export]"'
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,9 +147,10 @@ def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[st
         plain = "int8" if runtime == "onnx" and precision == "narrowest" else "float32"
         precision = "bfloat16" if device.type == "cuda" else plain
     if runtime == "onnx" and (missing or device.type != "cpu"):
-        what = f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}"
-        expected = "ONNX Runtime on the CPU"
-        raise WearcapError(what, expected=expected, fix=f"{_INSTALL}, or choose pipeline.runtime=eager.")
+        if missing:
+            raise extras.missing(missing[0], "runtime 'onnx'", "choose pipeline.runtime=eager")
+        expected, fix = "ONNX Runtime on the CPU", "Choose pipeline.runtime=eager."
+        raise WearcapError(f"runtime 'onnx' on {device}", expected=expected, fix=fix)
     if (precision == "int8") > (runtime == "onnx") or (precision == "bfloat16" and runtime == "onnx"):
         expected = "int8 with onnx; bfloat16 with eager or compile"
         raise WearcapError(f"no {precision} with runtime {runtime!r}", expected=expected)

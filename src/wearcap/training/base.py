@@ -1,34 +1,40 @@
 """The base of the LightningModules: seeded and compiled steps, optimiser from the config, logged losses."""
 
+import importlib.util
 import os
 import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import lightning
 import torch
 from jaxtyping import Float
-from lightning.pytorch.callbacks import Timer
 from torch import Tensor
 
 from wearcap.errors import require_choice
+
+if TYPE_CHECKING or importlib.util.find_spec("lightning"):
+    from lightning import LightningModule
+else:  # without the extra `train` modules are built to capture with, and cannot be trained
+    LightningModule = torch.nn.Module
 
 WORTH_COMPILING = 1000
 """Steps from which a compiled step saves a CPU more time than its compilation takes, a minute or two."""
 
 
-def is_logged(trainer: lightning.Trainer, step: int) -> bool:
+def is_logged(trainer: Any, step: int) -> bool:
     """Whether a step is one of those whose values are logged; reading them in others would only make it wait for a GPU."""
-    every: int = trainer.log_every_n_steps  # pyright: ignore[reportAttributeAccessIssue]
+    every: int = trainer.log_every_n_steps
     return every > 0 and step % every == 0
 
 
-def timer_of(trainer: lightning.Trainer) -> Timer | None:
-    """The clock of a run with `trainer.max_time`."""
-    return next((each for each in trainer.callbacks if isinstance(each, Timer)), None)  # pyright: ignore[reportAttributeAccessIssue]
+def timer_of(trainer: Any) -> Any:
+    """The clock (a `Timer`) of a run with `trainer.max_time`, else None."""
+    from lightning.pytorch.callbacks import Timer
+
+    return next((each for each in trainer.callbacks if isinstance(each, Timer)), None)
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,7 @@ class _Compilable(type):
         return made
 
 
-class Training(lightning.LightningModule, metaclass=_Compilable):
+class Training(LightningModule, metaclass=_Compilable):
     """Optimises the "loss" that `measure` returns, and logs all of its values, in training and validation.
 
     By default the loss is the sum of `terms` times `loss_weights`; a term without a weight is only logged.
@@ -155,7 +161,7 @@ class Training(lightning.LightningModule, metaclass=_Compilable):
         more = {"elapsed": partial(self._elapsed, timer)} if (timer := timer_of(self.trainer)) else {}
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler(optimizer, **more), "interval": "step"}}
 
-    def _elapsed(self, timer: Timer) -> float:
+    def _elapsed(self, timer: Any) -> float:
         """Share of `trainer.max_time` that has passed, with earlier starts of the run: the same in all processes."""
         passed = timer.time_elapsed()
         return self.trainer.strategy.broadcast(passed / max(passed + (timer.time_remaining() or 0.0), 1e-9))

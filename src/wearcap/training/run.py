@@ -351,12 +351,12 @@ def record_run(folder: Path, config_yaml: str) -> None:
         commit = subprocess.run(command, cwd=here, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         commit = "not a git checkout"
-    names = ("wearcap", "torch", "lightning", "numpy", "hydra-core", "numba", "anny")
+    names = ("torch", "lightning", "numpy", "hydra-core", "numba")
     record = {
         "commit": commit,
         "python": platform.python_version(),
         "machine": machine(),
-        "versions": {name: importlib.metadata.version(name) for name in names},
+        "versions": {"wearcap": __version__} | {name: importlib.metadata.version(name) for name in names},
     }
     remember_own(folder)
     write_text(folder / "config.yaml", config_yaml)

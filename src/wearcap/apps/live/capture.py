@@ -15,16 +15,16 @@ from typing import Any
 
 import torch
 
+from wearcap.apps.live.files_sink import FilesSink
 from wearcap.apps.live.packets import HEAD, Inbox, Packet
 from wearcap.apps.live.recent import Recent
 from wearcap.apps.live.setup import Known, Setup, hand_seat, write_setup
 from wearcap.apps.live.setup_estimation import SetupEstimation
 from wearcap.apps.live.sink import Sink, SinkThread
-from wearcap.apps.live.sinks.files import FilesSink
 from wearcap.apps.live.source import Source
 from wearcap.apps.live.status import Ask, LiveStatus
 from wearcap.apps.live.wearer import LiveWearer, Opener
-from wearcap.apps.web.sockets import LoopThread
+from wearcap.apps.web.loop import LoopThread
 from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid

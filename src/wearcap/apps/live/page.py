@@ -20,15 +20,8 @@ from wearcap.apps.live.page_panel import Panel
 from wearcap.apps.live.sink import Sink
 from wearcap.apps.live.status import MAX_POINTS, LiveControls, LiveStatus, WearerStatus
 from wearcap.apps.viewer.page import COLORS, UPDATES_PER_S
-from wearcap.apps.viewer.page_layers import (
-    BodyLayer,
-    FeetLayer,
-    LabelLayer,
-    MotionLayers,
-    ObjectsLayer,
-    add_points,
-    surface_or_sticks,
-)
+from wearcap.apps.viewer.page_layers import BodyLayer, FeetLayer, LabelLayer, MotionLayers, ObjectsLayer, add_points
+from wearcap.apps.viewer.shown import surface_or_sticks
 from wearcap.apps.web.page_server import ServedPage
 from wearcap.apps.web.page_text import fitting
 from wearcap.body.skeleton import Skeleton

@@ -8,7 +8,8 @@ import viser
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 
-from wearcap.apps.viewer.page_layers import add_cloud, by_height
+from wearcap.apps.viewer.page_layers import add_cloud
+from wearcap.apps.viewer.shown import by_height
 from wearcap.apps.web.page_text import fitting
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix

@@ -26,11 +26,9 @@ from wearcap.apps.viewer.page_layers import (
     MotionLayers,
     ObjectsLayer,
     add_points,
-    poses_at,
     read_scene,
-    surface_or_sticks,
-    with_objects,
 )
+from wearcap.apps.viewer.shown import poses_at, surface_or_sticks, with_objects
 from wearcap.apps.web.page_server import ServedPage
 from wearcap.apps.web.page_text import block, escaped
 from wearcap.errors import WearcapError, require_choice

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from wearcap.apps.viewer.camera_path import KEY_S, azimuths, smoothed
 from wearcap.apps.viewer.ground import Ground
-from wearcap.apps.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body, vertex_colors
+from wearcap.apps.viewer.shown import by_height, lit_points, posed_meshes, stick_body, vertex_colors
 from wearcap.body.contact_points import contact_points
 from wearcap.body.kinematics import site_positions
 from wearcap.body.model import BodyModel

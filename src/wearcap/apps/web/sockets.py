@@ -1,10 +1,7 @@
-"""WebSocket servers of sources and sinks: guarded, counted among all connections, each on a loop in a thread of its own."""
+"""WebSocket servers of sources and sinks: guarded, counted among all connections."""
 
-import asyncio
 import logging
-import threading
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Future
 from http import HTTPStatus
 from typing import Any
 
@@ -71,30 +68,3 @@ async def serve_sockets(
         server_header=None,
         logger=_QUIET,
     )
-
-
-class LoopThread:
-    """A loop of asyncio in a thread of its own."""
-
-    def __init__(self, name: str):
-        self.loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self.loop.run_forever, name=name, daemon=True)
-        self._thread.start()
-
-    def start(self, work: Coroutine[Any, Any, Any]) -> Future[Any]:
-        """Run a coroutine; what it returns or raises is the future's."""
-        return asyncio.run_coroutine_threadsafe(work, self.loop)
-
-    def stop(self) -> None:
-        """End the thread; what still runs on the loop is cancelled."""
-
-        async def cancel() -> None:
-            others = asyncio.all_tasks() - {asyncio.current_task()}
-            for task in others:
-                task.cancel()
-            await asyncio.gather(*others, return_exceptions=True)
-
-        self.start(cancel()).result()
-        self.loop.call_soon_threadsafe(self.loop.stop)
-        self._thread.join()
-        self.loop.close()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from wearcap.boundary.opening import read_bytes, understood
-from wearcap.errors import WearcapError
+from wearcap.extras import required
 from wearcap.io.conventions import AUTO, DETECTED, UNITS_M, Conventions
 from wearcap.io.formats.trc import Markers, markers_of, read_trc
 
@@ -45,11 +45,7 @@ def read_c3d(path: str | Path, conventions: Conventions = DETECTED) -> Markers:
     counts. Raises WearcapError without the library, and for a file that is damaged or shorter than it says.
     """
     conventions.only("unit", "up", where=path)
-    try:
-        import c3d
-    except ImportError as error:
-        fix = 'Run: pip install "wearcap[biomechanics]"'
-        raise WearcapError("C3D files need the package c3d", path, fix=fix) from error
+    c3d = required("c3d", "a C3D file")
     content, expected = read_bytes(path, "c3d"), "a whole C3D file: its header, parameters and frames"
     with understood("not a readable C3D file", path, expected, errors=_DAMAGE), warnings.catch_warnings():
         warnings.simplefilter("ignore")

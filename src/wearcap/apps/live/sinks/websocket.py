@@ -23,7 +23,8 @@ from wearcap.apps.live.sinks.objects import SeenObject, objects_of
 from wearcap.apps.live.source import Address, Addressed
 from wearcap.apps.web.connections import DELIVERING, SPOKEN
 from wearcap.apps.web.guard import LOOPBACK, Guard
-from wearcap.apps.web.sockets import LoopThread, serve_sockets
+from wearcap.apps.web.loop import LoopThread
+from wearcap.apps.web.sockets import serve_sockets
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
