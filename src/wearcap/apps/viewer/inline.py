@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from wearcap.apps.viewer.page_layers import surface_or_sticks
 from wearcap.apps.viewer.picture import write_video
+from wearcap.apps.viewer.shown import surface_or_sticks
 from wearcap.recording.motion import Motion
 
 
