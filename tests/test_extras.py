@@ -14,6 +14,7 @@ from wearcap.cli.verbs import VERBS
 from wearcap.errors import WearcapError
 from wearcap.extras import EXTRAS, at_first_use, required
 from wearcap.extras import VERBS as MODULES
+from wearcap.runtime.graphs import open_onnx
 
 ROOT = Path(__file__).parents[1]
 WALK = str(ROOT / "examples" / "headset_walk.csv")
@@ -133,3 +134,11 @@ def test_the_table_names_extras_of_the_project():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(EXTRAS.values()) <= set(extras)
     assert {module for modules in MODULES.values() for module in modules} <= set(EXTRAS)
+
+
+def test_an_onnx_file_names_the_extra_that_runs_it(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(
+        WearcapError, match=r"an ONNX file needs the package 'onnxruntime'. Run: pip install \"wearcap\[export\]\""
+    ):
+        open_onnx(tmp_path / "x.onnx")
