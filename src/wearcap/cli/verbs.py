@@ -20,7 +20,7 @@ VERBS = {
     "evaluate": "score checkpoints on a data set: checkpoint=hmd2 dataset=DIR",
     "capture": "turn recordings into motion: recording=FILE, or a DATASET",
     "live": "capture while people move: system=hmd2 source=vmc://:39540",
-    "export": "export a network: checkpoint=… format=pt2|onnx|safetensors",
+    "export": "export a network: checkpoint=… format=onnx|pt2|web|safetensors",
     "prepare": "make a data set: prepare simulated, prepare cmu source=DIR",
     "view": "show a recording in the browser: recording=DATASET/NAME",
     "render": "pictures without a screen: recording=DATASET/NAME out=x.png",

@@ -26,6 +26,8 @@ MAX_FILL = 600
 """Largest ratio of frames at the model's rate to head poses; above it the timestamps are not in seconds."""
 MAX_SPEED_M_S = 12.0
 """Highest plausible speed of a head (faster than sprinters); a faster step is a jump of the tracking."""
+MAX_TURN_RAD_S = 60.0
+"""Highest plausible angular speed of a head."""
 
 
 _SAME_S = 1e-4
@@ -113,7 +115,7 @@ def _breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
     step = trajectory.timestamps.diff()
     speed = trajectory.t_world_body.diff(dim=0).norm(dim=-1) / step
     turn = rotation.geodesic(trajectory.R_world_body[:-1], trajectory.R_world_body[1:]) / step
-    broken = (step > MAX_GAP_S) | (speed > MAX_SPEED_M_S) | (turn > 60.0)
+    broken = (step > MAX_GAP_S) | (speed > MAX_SPEED_M_S) | (turn > MAX_TURN_RAD_S)
     return [
         (trajectory.timestamps[i].item(), trajectory.timestamps[i + 1].item()) for i in broken.nonzero()[:, 0].tolist()
     ]

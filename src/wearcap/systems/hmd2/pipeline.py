@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
@@ -221,13 +221,30 @@ class HMD2(LearnedSystem):
 
     def _predict(self, samplers: Sequence[WindowSampler]) -> None:
         """Predict one window of every batch item."""
-        net, features, device, count = self.model.net, self.model.features, self.device, self.window
+        count = self.window
         frames = batched([sampler.frames for sampler in samplers if sampler.frames is not None], count)
         predicted = batched([sampler.predicted for sampler in samplers], count)
         number = torch.arange(count)
         is_observed = number < torch.tensor([[sampler.final_count] for sampler in samplers])
         valid = frames.valid & (number < torch.tensor([[sampler.count] for sampler in samplers]))
         size = torch.stack([sampler.size for sampler in samplers])
+        poses = self.window_poses(frames._replace(valid=valid), predicted, is_observed, size)
+        for item, sampler in enumerate(samplers):
+            mine = (part[item : item + 1, : sampler.count] for part in (*poses, predicted.noise))
+            sampler.predicted = Predicted(*mine)
+
+    def window_poses(
+        self,
+        frames: Frames,
+        predicted: Predicted,
+        is_observed: Bool[Tensor, "batch time"],
+        size: Float[Tensor, "batch limb"],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Rotations, contacts and deviations of full windows, as in `Predicted`; observed frames keep theirs.
+
+        `size`: as of `HeadFeatures.condition`.
+        """
+        net, features, device, valid = self.model.net, self.model.features, self.device, frames.valid
         head = features.condition(frames.R_world_head, frames.t_world_head, frames.floor_height, size, self.model.fps)
         conditions = Conditions(*(part.to(device) for part in (head, frames.others, frames.given)))
         # The last window's poses are re-expressed in this window's canonical frame, which may have moved.
@@ -247,13 +264,11 @@ class HMD2(LearnedSystem):
         x0 = blended(x0, observed, is_observed_on_device, self.overlap.fade)
         motion = net.motion_normalizer.inverse(x0.float()).cpu()
         found = *features.decode(motion, frames.R_world_head), features.joint_std(motion)
-        poses = [
+        R, contact, std = (
             torch.where(is_observed.reshape(*is_observed.shape, *[1] * (old.ndim - 2)), old, new)
             for old, new in zip(predicted[:3], found)
-        ]
-        for item, sampler in enumerate(samplers):
-            mine = (part[item : item + 1, : sampler.count] for part in (*poses, predicted.noise))
-            sampler.predicted = Predicted(*mine)
+        )
+        return R, contact, std
 
     def _refined(self, path: HeadPath, samplers: Sequence[WindowSampler]) -> Motion:
         """Steps 5 and 6 of a whole recording."""
