@@ -144,6 +144,10 @@ def test_the_wheel_carries_every_config_and_split_list(unpacked, tmp_path):
         assert expected == {
             path.relative_to(resources / theirs) for path in (resources / theirs).rglob("*") if path.is_file()
         }
+    (described,) = unpacked.glob("*.dist-info/METADATA")
+    links = re.findall(r"\]\(([^)]+)\)", described.read_text(encoding="utf-8"))
+    assert len(links) > 20, "README, as an index shows it"
+    assert [link for link in links if not link.startswith("https://")] == []
     ended = run(unpacked, tmp_path, "-c", "from wearcap.cli import conf; print(conf.conf_dir(), conf.splits_dir())")
     assert ended.stdout.split() == [str(resources / "conf"), str(resources / "splits")]
 
