@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.wearcap-installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-real lint format lock registry release addon clean
+.PHONY: help install demo test test-real lint format lock registry release addon site site-serve clean
 
 help:
 	@echo "make demo       prepare simulated data, train, evaluate, capture, export (about 2 minutes on 2 quiet cores)"
@@ -16,6 +16,7 @@ help:
 	@echo "make registry   checkpoints/registry.json from the files beside it"
 	@echo "make release    check, build and try a release, and print the commands that publish it"
 	@echo "make addon      dist/wearcap_blender.zip, the Blender add-on"
+	@echo "make site       build/site, the documentation with its notebooks executed; make site-serve shows it while it is written"
 	@echo "make clean      remove $(VENV)"
 	@echo "PYTHON=python3.12 make demo  takes another interpreter (3.11 to 3.13)"
 
@@ -51,7 +52,7 @@ format: $(STAMP)
 lock:
 	rm -rf $(VENV)-lock
 	$(PYTHON) -m venv $(VENV)-lock
-	$(VENV)-lock/bin/python -m pip install --quiet -e '.[dev]' torch==2.13.0
+	$(VENV)-lock/bin/python -m pip install --quiet -e '.[dev,site]' torch==2.13.0
 	{ sed -n '/^#/p' requirements.lock; $(VENV)-lock/bin/python -m pip freeze --exclude-editable \
 	  | grep -v -E '^(nvidia-|triton|cuda-)' | sed 's/+cpu$$//' | sort -f; } > requirements.lock.new
 	mv requirements.lock.new requirements.lock
@@ -67,6 +68,19 @@ release: $(STAMP)
 addon:
 	mkdir -p dist
 	$(PYTHON) -m zipfile -c dist/wearcap_blender.zip integrations/blender/wearcap_blender/*.*
+
+site: $(VENV)/.site-installed $(patsubst examples/%,build/%,$(wildcard examples/notebooks/*.ipynb))
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+site-serve: $(VENV)/.site-installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
+
+build/notebooks/%.ipynb: examples/notebooks/%.ipynb | $(VENV)/.site-installed
+	$(BIN)/python -m nbconvert --to notebook --execute --output-dir $(@D) $<
+
+$(VENV)/.site-installed: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[site]'
+	@touch $@
 
 clean:
 	rm -rf $(VENV)

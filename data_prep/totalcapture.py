@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -28,6 +27,7 @@ from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.files import content_hash
 from wearcap.geometry import rotation
+from wearcap.geometry.light_roma import roma
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.devices.axes import WORLDS
 from wearcap.io.formats.poses import NORM_TOLERANCE

@@ -56,8 +56,6 @@ def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesS
     )
     for gap in watch_gaps(recording.imu, recording.head.timestamps):
         notes.append(gap)
-    if recording.skeleton is None:
-        notes.append("height not given: taken from how high the head is carried, where the floor is known")
     return replace(recording, note="; ".join(notes))
 
 

@@ -19,8 +19,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 WALK = "headset_walk.csv"
-CAPTURE = ["wearcap", "capture", f"recording={WALK}", "height=1.68", "output=out"]
-LOAD = "import wearcap; assert len(wearcap.load('echo')(wearcap.read('headset_walk.csv', height=1.68))) > 400"
+CAPTURE = ["wearcap", "capture", f"recording={WALK}", "height=1.74", "output=out"]
+LOAD = "import wearcap; assert len(wearcap.load('echo')(wearcap.read('headset_walk.csv', height=1.74))) > 400"
 LEAN = "import importlib.util as u; assert not [m for m in ('lightning', 'viser', 'cv2', 'onnx', 'anny', 'warp') if u.find_spec(m)]"
 SIFT = "import numpy as np; from wearcap.localization.features import RootSift; RootSift()(np.zeros((64, 64, 3), np.uint8))"
 CORE = (CAPTURE, ["wearcap", "render", WALK, "motion=out/motion.npz", "frames=2", "out=x.png"], ["python", "-c", LOAD])

@@ -14,6 +14,7 @@ from wearcap.cli.verbs import VERBS
 from wearcap.errors import WearcapError
 from wearcap.extras import EXTRAS, at_first_use, required
 from wearcap.extras import VERBS as MODULES
+from wearcap.runtime.graphs import open_onnx
 
 ROOT = Path(__file__).parents[1]
 WALK = str(ROOT / "examples" / "headset_walk.csv")
@@ -60,9 +61,16 @@ for verb, arguments in json.loads(sys.argv[1]).items():
         except SystemExit as ended:
             code = ended.code
     runs[verb] = [code, err.getvalue(), time.time() - began]
+import importlib, pkgutil, wearcap
+for name in ("hps", "ireplica", "hmd2", "mocap_every", "echo"):
+    wearcap.load(name)
+for package in ("wearsim", "data_prep"):
+    for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}."):
+        importlib.import_module(module.name)
 print(json.dumps(runs))
 """
-"""Runs verbs one after the other, and prints their exit codes and what they wrote to stderr."""
+"""Runs verbs one after the other, and prints their exit codes and what they wrote to stderr; then
+loads every system, and imports all that prepares and simulates."""
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +134,11 @@ def test_the_table_names_extras_of_the_project():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(EXTRAS.values()) <= set(extras)
     assert {module for modules in MODULES.values() for module in modules} <= set(EXTRAS)
+
+
+def test_an_onnx_file_names_the_extra_that_runs_it(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(
+        WearcapError, match=r"an ONNX file needs the package 'onnxruntime'. Run: pip install \"wearcap\[export\]\""
+    ):
+        open_onnx(tmp_path / "x.onnx")

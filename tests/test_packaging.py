@@ -39,16 +39,16 @@ def pins() -> dict[str, str]:
 
 def test_every_dependency_of_the_developers_install_is_pinned(project, pins):
     extras = project["optional-dependencies"]
-    wanted = names_of(project["dependencies"]) | names_of(extras["dev"]) - {"wearcap"}
-    for extra in ("train", "view", "live", "scene", "export", "cluster"):
-        wanted |= names_of(extras[extra]) - {"wearcap"}
-    assert not wanted - set(pins)
+    wanted = names_of(project["dependencies"]) | names_of(extras["dev"])
+    for extra in ("train", "view", "live", "scene", "export", "cluster", "notebooks", "site"):
+        wanted |= names_of(extras[extra])
+    assert not wanted - set(pins) - {"wearcap"}
     assert pins["torch"] == "2.13.0"
     assert "wearcap" not in pins
 
 
 def test_one_version_everywhere(project):
-    assert project["dynamic"] == ["version"]
+    assert set(project["dynamic"]) == {"readme", "version"}
     assert f"version: {__version__}" in (ROOT / "CITATION.cff").read_text()
     assert newest((ROOT / "CHANGELOG.md").read_text(encoding="utf-8"))[0] == __version__
 
@@ -125,8 +125,8 @@ def unpacked(tmp_path_factory) -> Path:
     return folder / "site"
 
 
-def run(site: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess:
-    environment = os.environ | {"PYTHONPATH": str(site)}
+def run(site: Path, cwd: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": str(site)} | variables
     return subprocess.run(
         [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, check=False
     )
@@ -144,6 +144,10 @@ def test_the_wheel_carries_every_config_and_split_list(unpacked, tmp_path):
         assert expected == {
             path.relative_to(resources / theirs) for path in (resources / theirs).rglob("*") if path.is_file()
         }
+    (described,) = unpacked.glob("*.dist-info/METADATA")
+    links = re.findall(r"\]\(([^)]+)\)", described.read_text(encoding="utf-8"))
+    assert len(links) > 20, "README, as an index shows it"
+    assert [link for link in links if not link.startswith("https://")] == []
     ended = run(unpacked, tmp_path, "-c", "from wearcap.cli import conf; print(conf.conf_dir(), conf.splits_dir())")
     assert ended.stdout.split() == [str(resources / "conf"), str(resources / "splits")]
 
@@ -162,6 +166,13 @@ def test_the_command_works_from_the_wheel(unpacked, tmp_path):
     count, file = run(unpacked, tmp_path, "-c", listed).stdout.split()
     assert int(count) == len(list((ROOT / "checkpoints").glob("*.safetensors")))
     assert file == str(unpacked / "wearcap/_resources/checkpoints" / FIRST)
+    lacking = run(unpacked, tmp_path, "-m", "wearcap.cli.main", "evaluate", "hmd2", WEARCAP_WEIGHTS=str(tmp_path))
+    assert lacking.returncode == 2
+    assert re.fullmatch(
+        r"wearcap evaluate: .*: no hmd2\.safetensors in WEARCAP_WEIGHTS\. Download https\S+ into it\.\n", lacking.stderr
+    )
+    held = "from wearcap.models.checkpoint import read_checkpoint; print(read_checkpoint('hmd2')[0]['name'])"
+    assert run(unpacked, tmp_path, "-c", held, WEARCAP_WEIGHTS=str(ROOT / "checkpoints")).stdout == "hmd2\n"
     typo = run(unpacked, tmp_path, "-m", "wearcap.cli.main", "train", "data=smulated")
     assert typo.returncode == 2
     assert "Did you mean 'simulated'" in typo.stderr

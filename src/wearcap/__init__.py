@@ -22,7 +22,7 @@ def read(path, height: float | None = None, **stated):
     """The `recording.Recording` in any file or folder that holds one: a prepared recording, MVNX, BVH, AMASS, MPS, logs …
 
     `height` (m) is the wearer's; without it, and without a skeleton in the file, it follows from how high the head is
-    carried. `stated` is what the file's content need not decide: unit="cm", up="y", axes="unity" … (`io.conventions`).
+    carried. `stated` is what the file's content need not decide: unit="cm", up="y", axes="unity" … (`io.conventions.Conventions`).
     Raises WearcapError for what cannot be read.
     """
     return source(path, height, **stated).recording
@@ -58,3 +58,15 @@ def save(motion, path, rig=None, keep_hands: bool = False) -> None:
         save_motion(motion, path)
     else:
         write_on_rig(motion, read_rig(rig), path, keep_hands)
+
+
+def show(motion=None, seconds: float = 10.0, fps: float = 15.0, size: tuple[int, int] = (360, 320), **labelled):
+    """A video of a `recording.Motion` for a notebook, which shows it where it is the value of a cell (`apps.viewer.inline.Video`).
+
+    `labelled` are further motions of the same moments, or all of them, by their labels (truth=recording.motion). Each has a panel of
+    `size` (width, height, in pixels). The video lasts `seconds` at most. Raises WearcapError for no motion, for motions that share no
+    time, and for odd sizes.
+    """
+    from wearcap.apps.viewer.inline import Video
+
+    return Video.of(labelled if motion is None else {"motion": motion, **labelled}, fps, size, seconds)

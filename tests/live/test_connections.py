@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage
 
 from ports import free_port
 from silent_sockets import silent
-from wearcap.apps.live import capture
+from wearcap.apps.live import capture, files_sink
 from wearcap.apps.live.files_sink import FilesSink
 from wearcap.apps.live.packets import Packet
 from wearcap.apps.live.sink import SinkThread

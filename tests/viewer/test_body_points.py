@@ -15,6 +15,7 @@ from wearcap.apps.viewer.shown import (
     BRIGHT,
     DIM,
     _true_body_contact,
+    lit_color,
     lit_points,
     poses_at,
     stick_body,

@@ -203,6 +203,7 @@ class EchoContent(Content):
         values |= {f"{kind}_world_canonical": window.values[f"{kind}_world_{chosen}"] for kind in "Rt"}
         return EchoWindow(
             **values,
+            seen=torch.ones(values["t_world_point"].shape[:-1], dtype=torch.bool),
             has_object=active != NO_OBJECT,
             object_code=code,
             object_mean=mean,

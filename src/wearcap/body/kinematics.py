@@ -39,12 +39,17 @@ def forward_kinematics(
     offsets = offsets.to(R_parent_joint)
     if not _can_fuse(R_parent_joint, t_world_root, offsets):
         return level_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets)
-    return Rigid(*_fused(skeleton, R_parent_joint, t_world_root, offsets))
+    if torch.compiler.is_dynamo_compiling():
+        from wearcap.body.kinematics_uncompiled import fused  # importing the compiler takes longer than PyTorch
+
+        return Rigid(*fused(skeleton, R_parent_joint, t_world_root, offsets))
+    return Rigid(*fused_kinematics(skeleton, R_parent_joint, t_world_root, offsets))
 
 
-@torch.compiler.disable
-def _fused(skeleton: Skeleton, R_parent_joint: Tensor, t_world_root: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """`forward_kinematics` by the kernels, to which a compiled function returns."""
+def fused_kinematics(
+    skeleton: Skeleton, R_parent_joint: Tensor, t_world_root: Tensor, offsets: Tensor
+) -> tuple[Tensor, Tensor]:
+    """`forward_kinematics` by the kernels."""
     batch, joints = R_parent_joint.shape[:-3], len(skeleton)
     # Expanding raises on shapes that do not fit: the kernels check nothing.
     R_local, t_root = R_parent_joint.expand(*batch, joints, 3, 3), t_world_root.expand(*batch, 3)
@@ -85,10 +90,13 @@ def _plan(parents: tuple[int, ...], device: torch.device) -> tuple[list[tuple[Te
 _cached_plan = lru_cache(maxsize=64)(_plan)
 
 
-@torch.compiler.assume_constant_result
 def _kept_plan(parents: tuple[int, ...], device: torch.device) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
     """Index tensors per device: copying them to a GPU in every call would synchronise with it."""
     return _cached_plan(parents, device)
+
+
+_kept_plan._dynamo_marked_constant = True  # pyright: ignore[reportFunctionMemberAccess]
+"""`torch.compiler.assume_constant_result`, without importing the compiler."""
 
 
 def site_positions(skeleton: Skeleton, T_world_joint: Rigid, names: tuple[str, ...]) -> Float[Tensor, "*batch site 3"]:

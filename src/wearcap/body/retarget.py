@@ -6,7 +6,6 @@ whatever their bind poses, and are what retargeting transfers.
 
 from dataclasses import replace
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,6 +14,7 @@ from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.landmarks import TPose, t_pose
 from wearcap.body.skeleton import SIDES, Site, Skeleton
 from wearcap.body.skeletons import FINGER_JOINTS
+from wearcap.geometry.light_roma import roma
 from wearcap.geometry.rotation import swing_between
 
 

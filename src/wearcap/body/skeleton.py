@@ -99,6 +99,7 @@ class Skeleton:
         raise WearcapError(what, expected=f"one like {near or self.joint_names}")
 
     def indices(self, *names: str) -> list[int]:
+        """Positions of joints by name. Raises WearcapError as `index` does."""
         return [self.index(name) for name in names]
 
     def __contains__(self, name: str) -> bool:

@@ -16,13 +16,16 @@ class Rigid:
 
     @classmethod
     def identity(cls, *batch: int, dtype: torch.dtype = torch.float32) -> "Rigid":
+        """No rotation and no translation, of a batch's shape."""
         return cls(torch.eye(3, dtype=dtype).expand(*batch, 3, 3), torch.zeros(*batch, 3, dtype=dtype))
 
     @classmethod
     def from_matrix(cls, matrix: Float[Tensor, "*batch 4 4"]) -> "Rigid":
+        """The pose that a homogeneous matrix holds."""
         return cls(matrix[..., :3, :3], matrix[..., :3, 3])
 
     def matrix(self) -> Float[Tensor, "*batch 4 4"]:
+        """The pose as a homogeneous matrix."""
         top = torch.cat([self.R, self.t[..., None]], -1)
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
         return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], -2)
@@ -38,6 +41,7 @@ class Rigid:
         return Rigid(self.R @ other.R, self @ other.t)
 
     def inverse(self) -> "Rigid":
+        """Pose of a in b."""
         R_inverse = self.R.transpose(-1, -2)
         return Rigid(R_inverse, -(R_inverse @ self.t[..., None])[..., 0])
 
@@ -46,4 +50,5 @@ class Rigid:
         return Rigid(self.R[index], self.t[index])
 
     def to(self, *args, **kwargs) -> "Rigid":
+        """As `Tensor.to`, of both parts."""
         return Rigid(self.R.to(*args, **kwargs), self.t.to(*args, **kwargs))

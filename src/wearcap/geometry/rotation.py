@@ -5,10 +5,11 @@ Every function is batched over leading axes and differentiable, at the identity 
 
 import math
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from wearcap.geometry.light_roma import roma
 
 
 def exp(rotvec: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

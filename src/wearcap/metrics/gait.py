@@ -4,9 +4,9 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
+import scipy
 import torch
 from jaxtyping import Bool, Float, Float64
-from scipy.signal import find_peaks
 from torch import Tensor
 
 from wearcap.body.skeleton import SIDES
@@ -59,7 +59,9 @@ def cycle_times(motion: Motion) -> list[Float64[Tensor, "cycle point"]]:
     found = []
     for k, side in enumerate(SIDES):
         ankle, cycles = motion.joint(f"{side}_ankle").t[:, 2].numpy(), []
-        peaks, _ = find_peaks(flexion[:, k], _PEAK_DEG, distance=max(round(0.45 * motion.fps), 1), prominence=15)
+        peaks, _ = scipy.signal.find_peaks(
+            flexion[:, k], _PEAK_DEG, distance=max(round(0.45 * motion.fps), 1), prominence=15
+        )
         for start, stop in pairwise(peaks.tolist()):
             seconds, gone = times[stop] - times[start], path[stop] - path[start]
             steps = np.linalg.norm(np.diff(path[start : stop + 1, :2], axis=0), axis=-1).sum()

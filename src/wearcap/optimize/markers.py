@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -22,6 +21,7 @@ from wearcap.body.position_fit import fit_positions
 from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.light_roma import roma
 from wearcap.io.formats.trc import Markers
 from wearcap.optimize.losses import Loss
 from wearcap.recording.motion import Motion

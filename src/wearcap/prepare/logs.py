@@ -168,8 +168,6 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
         floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
     camera = _camera(settings.video, head)
     skeleton = settings.skeleton()
-    if skeleton is None:
-        note += "; height not given: taken from how high the head is carried, where the floor is known"
     return Recording(
         name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, origin=origin, note=note, **about
     )
@@ -268,14 +266,6 @@ class HeadsetSettings:
         log = read_headset_log(path, how, self.time_unit)
         mount = pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
         head = HeadStream(log.head.timestamps, log.head.R_world_body, log.head.t_world_body, mount.R, mount.t)
-        notes = [
-            *log.notes,
-            *(
-                []
-                if self.height is not None
-                else ["height not given: taken from how high the head is carried, where the floor is known"]
-            ),
-        ]
         return Recording(
             name,
             head=head,
@@ -283,7 +273,7 @@ class HeadsetSettings:
             fingers=log.fingers,
             floor=FloorTrack(head.timestamps[:1], torch.zeros(1)) if log.floor else None,
             skeleton=None if self.height is None else skeleton_of_height(float(self.height)),
-            note="; ".join(notes),
+            note="; ".join(log.notes),
             **about,
         )
 

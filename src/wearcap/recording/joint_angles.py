@@ -8,13 +8,13 @@ of the distal segment, which is the Euler sequence of these axes. Segments have 
 import math
 from typing import NamedTuple
 
-import roma
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.landmarks import t_pose
 from wearcap.body.skeleton import SIDES
+from wearcap.geometry.light_roma import roma
 from wearcap.geometry.rotation import about_axis
 from wearcap.recording.motion import Motion
 

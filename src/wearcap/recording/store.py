@@ -128,6 +128,7 @@ class RecordingFile:
         return self._file.get_slice(key).get_shape()[0]
 
     def tensor(self, key: str) -> Tensor:
+        """A whole tensor."""
         self._require(key)
         return self._file.get_tensor(key)
 
@@ -145,6 +146,7 @@ class RecordingFile:
         return part
 
     def load(self) -> Recording:
+        """The whole recording. Raises WearcapError for a description that cannot be understood."""
         with self._described():
             recording = unflatten(self._tree, cache(self.tensor))
             if not isinstance(recording, Recording):
@@ -242,6 +244,7 @@ class RecordingStore:
         write_text(self.manifest_path, text + "\n")
 
     def path_of(self, name: str) -> Path:
+        """File of a recording. Raises WearcapError for a name that is no plain file name."""
         return recording_path(self.root, name)
 
     def require(self, name: str) -> None:

@@ -206,10 +206,7 @@ def open_onnx(path: str | Path) -> Run:
     Its operators are ONNX Runtime's own, its weights in the file or beside it (ONNX Runtime refuses others). Raises
     WearcapError when it is missing or not readable.
     """
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise WearcapError("running ONNX files needs onnxruntime", fix=_INSTALL) from error
+    onnxruntime = extras.required("onnxruntime", "an ONNX file")
     file_size(path, "exported model")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import av
 import numpy as np
-import scipy.ndimage
-import scipy.signal
+import scipy
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.ndimage
-import scipy.signal
+import scipy
 import torch
 from jaxtyping import Float64, Int64
 from scipy.special import ndtr

@@ -20,7 +20,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import roma
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -31,6 +30,7 @@ from wearcap.boundary.texts import read_json_object
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
+from wearcap.geometry.light_roma import roma
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.recording.recording import FloorTrack, HeadStream, ImuStream, PointCloud, Recording

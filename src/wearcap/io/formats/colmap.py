@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
 
@@ -20,6 +19,7 @@ from wearcap.boundary.opening import read_bytes, understood
 from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.light_roma import roma
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.scan import Photo
 
