@@ -457,6 +457,9 @@ def test_a_client_that_does_not_read_is_disconnected_and_the_others_get_all():
         reading = threading.Thread(target=read)
         reading.start()
         thread.begin("anna", motion.skeleton, 60.0)
+        begun_s = time.monotonic()
+        while not got and time.monotonic() < begun_s + 10.0:  # the reader is served from here on
+            time.sleep(0.01)
         for _ in range(40):
             thread.take("anna", motion)
             time.sleep(0.05)

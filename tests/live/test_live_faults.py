@@ -329,8 +329,8 @@ def test_the_last_frames_are_sent_before_a_capture_has_ended():
     thread.start()
     with connect(sink.url) as client:
         thread.begin("", motion.skeleton, 60.0)
+        assert "skeleton" in json.loads(client.recv(10.0))  # the client is served from here on
         thread.take("", motion)
-        assert "skeleton" in json.loads(client.recv(10.0))
         reading = threading.Thread(target=lambda: [*client])
         reading.start()
         thread.close()
