@@ -96,5 +96,5 @@ def test_what_is_missing_is_named(package, monkeypatch, tmp_path):
     with pytest.raises(WearcapError, match="WEARCAP_HANDS_MODEL.*Download it"):
         MediaPipeHands()
     monkeypatch.setitem(sys.modules, "mediapipe", None)
-    with pytest.raises(WearcapError, match=r"need the package 'mediapipe'.*wearcap\[hands\]"):
+    with pytest.raises(WearcapError, match=r"needs the package 'mediapipe'.*wearcap\[hands\]"):
         MediaPipeHands()
