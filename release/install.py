@@ -48,7 +48,7 @@ def size_mb(folder: Path) -> float:
 
 
 def run(command: list[str], place: Path, environment: Path) -> str:
-    """Run a command of an environment in a folder; returns what it said when it failed, else ""."""
+    """Run a command of an environment in a folder; returns its messages when it failed, else ""."""
     scripts = environment / ("Scripts" if os.name == "nt" else "bin")
     plain = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
     variables = plain | {"WEARCAP_CACHE": str(place / "cache"), "no_proxy": "*"}
