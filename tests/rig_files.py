@@ -37,22 +37,45 @@ def joints() -> list[tuple[str, str, np.ndarray]]:
     ]
 
 
-def write(path: Path, vrm: bool, size: float = 1.0) -> dict:
-    """Write a character; `vrm` faces -z, is A-posed and has nameless names. Returns its JSON."""
-    rows, scale = joints(), 100.0 if not vrm else 1.0
-    face = Rotation.from_euler("y", 180 if vrm else 0, degrees=True)
-    rng = np.random.default_rng(5)
-    number = {name: k for k, (name, _, _) in enumerate(rows)}
-    world: list[tuple[Rotation, np.ndarray]] = []
-    down = Rotation.identity()
-    nodes: list[dict] = []
-    for name, parent, offset in rows:
-        bend = {"LeftArm": -45, "RightArm": 45}.get(name, 0) if vrm else 0
-        above_pose, above = (down, np.zeros(3)) if not parent else world[number[parent]]
-        pose = Rotation.from_euler("z", bend, degrees=True) * above_pose
-        world.append((pose, above + above_pose.apply(offset * size)))
-    own = [face * Rotation.from_rotvec(0 * rng.normal(size=3) if vrm else rng.normal(size=3)) for _ in rows]
-    place = [face.apply(t) for _, t in world]
+def packed(arrays: list[np.ndarray]) -> tuple[bytes, list[dict], list[dict]]:
+    """A buffer of vertices, joints, weights, matrices and indices, with its views and accessors."""
+    binary, views = b"", []
+    for array in arrays:
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": array.nbytes})
+        binary += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    kinds = [(5126, "VEC3"), (5121, "VEC4"), (5126, "VEC4"), (5126, "MAT4"), (5123, "SCALAR")]
+    accessors = [
+        {"bufferView": k, "componentType": c, "count": len(a), "type": t}
+        for k, (a, (c, t)) in enumerate(zip(arrays, kinds))
+    ]
+    return binary, views, accessors
+
+
+def humanoid(number: dict[str, int]) -> list[dict]:
+    """VRM's bones of the nodes by their names."""
+    bones = []
+    for name, k in number.items():
+        side, part = (
+            ("left", name[4:]) if name[:4] == "Left" else ("right", name[5:]) if name[:5] == "Right" else ("", name)
+        )
+        if part in VRM:
+            bones.append({"bone": side + VRM[part], "node": k, "useDefaultValues": True})
+    return bones
+
+
+def glb(document: dict, binary: bytes) -> bytes:
+    """A .glb file of its JSON and its buffer."""
+    text = json.dumps(document, ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 4)
+    whole = (
+        struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)) + struct.pack("<I4s", len(text), b"JSON") + text
+    )
+    return whole + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+
+
+def bone_nodes(rows: list, own: list[Rotation], place: list[np.ndarray], vrm: bool, scale: float) -> list[dict]:
+    """Nodes of bones with these rotations and places in the world."""
+    number, nodes = {name: k for k, (name, _, _) in enumerate(rows)}, list[dict]()
     for k, (name, parent, _) in enumerate(rows):
         R_above, t_above = (
             (own[number[parent]], place[number[parent]]) if parent else (Rotation.identity(), np.zeros(3))
@@ -66,6 +89,25 @@ def write(path: Path, vrm: bool, size: float = 1.0) -> dict:
         })  # fmt: skip
         if not nodes[-1]["children"]:
             del nodes[-1]["children"]
+    return nodes
+
+
+def write(path: Path, vrm: bool, size: float = 1.0) -> dict:
+    """Write a character; `vrm` faces -z, is A-posed and has nameless names. Returns its JSON."""
+    rows, scale = joints(), 100.0 if not vrm else 1.0
+    face = Rotation.from_euler("y", 180 if vrm else 0, degrees=True)
+    rng = np.random.default_rng(5)
+    number = {name: k for k, (name, _, _) in enumerate(rows)}
+    world: list[tuple[Rotation, np.ndarray]] = []
+    down = Rotation.identity()
+    for name, parent, offset in rows:
+        bend = {"LeftArm": -45, "RightArm": 45}.get(name, 0) if vrm else 0
+        above_pose, above = (down, np.zeros(3)) if not parent else world[number[parent]]
+        pose = Rotation.from_euler("z", bend, degrees=True) * above_pose
+        world.append((pose, above + above_pose.apply(offset * size)))
+    own = [face * Rotation.from_rotvec(0 * rng.normal(size=3) if vrm else rng.normal(size=3)) for _ in rows]
+    place = [face.apply(t) for _, t in world]
+    nodes = bone_nodes(rows, own, place, vrm, scale)
     low = min(t[1] for t in place) - SOLE * size
     vertices = np.array([*place, [0.05, low, 0.1], [0.05, low, 0.2], [0.1, low, 0.1]], "<f4")
     joint = np.zeros((len(vertices), 4), "u1")
@@ -82,15 +124,7 @@ def write(path: Path, vrm: bool, size: float = 1.0) -> dict:
         bind.swapaxes(1, 2).astype("<f4"),
         np.arange(len(vertices) // 3 * 3, dtype="<u2"),
     ]
-    binary, views = b"", []
-    for array in arrays:
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": array.nbytes})
-        binary += array.tobytes() + b"\0" * (-array.nbytes % 4)
-    kinds = [(5126, "VEC3"), (5121, "VEC4"), (5126, "VEC4"), (5126, "MAT4"), (5123, "SCALAR")]
-    accessors = [
-        {"bufferView": k, "componentType": c, "count": len(a), "type": t}
-        for k, (a, (c, t)) in enumerate(zip(arrays, kinds))
-    ]
+    binary, views, accessors = packed(arrays)
     accessors[0] |= {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
     top, figure = len(nodes), len(nodes) + 1
     armature = {"name": "Armature", "children": [0], "scale": [1 / scale] * 3}
@@ -107,23 +141,11 @@ def write(path: Path, vrm: bool, size: float = 1.0) -> dict:
         "extensionsUsed": ["KHR_materials_unlit"],
     }  # fmt: skip
     if vrm:
-        bones = []
-        for name, k in number.items():
-            side, part = (
-                ("left", name[4:]) if name[:4] == "Left" else ("right", name[5:]) if name[:5] == "Right" else ("", name)
-            )
-            if part in VRM:
-                bones.append({"bone": side + VRM[part], "node": k, "useDefaultValues": True})
         document["extensions"] = {
-            "VRM": {"specVersion": "0.0", "humanoid": {"humanBones": bones}, "meta": {"title": "own"}}
+            "VRM": {"specVersion": "0.0", "humanoid": {"humanBones": humanoid(number)}, "meta": {"title": "own"}}
         }
         document["extensionsUsed"].append("VRM")
-    text = json.dumps(document, ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 4)
-    whole = (
-        struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)) + struct.pack("<I4s", len(text), b"JSON") + text
-    )
-    path.write_bytes(whole + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    path.write_bytes(glb(document, binary))
     return document
 
 
